@@ -1,0 +1,34 @@
+"""Imitate a demonstrated pick-and-place trajectory on new objects: Trajectory Descriptor Fields in JAX."""
+
+from tdf_jax.checkpoint import available_models, load_model, save_model
+from tdf_jax.convert import convert_checkpoint
+from tdf_jax.demonstration import Demonstration, Reference, describe
+from tdf_jax.descriptor import pose_descriptor, trajectory_descriptor
+from tdf_jax.energy import (
+    EnergyWeights,
+    compensator_loss,
+    correlation_loss,
+    descriptor_loss,
+    trajectory_energy,
+)
+from tdf_jax.errors import InputError
+from tdf_jax.field import DescriptorField
+from tdf_jax.imitation import imitate, imitate_batch
+from tdf_jax.model import Model, ModelInfo, encode
+from tdf_jax.network import NetworkConfig
+from tdf_jax.optimize import OptimizeConfig, Result, optimize
+from tdf_jax.pointcloud import load_mesh, load_points, sample_surface, thin
+from tdf_jax.query import box_query, gaussian_query, gripper_query, lattice_query
+from tdf_jax.trajectory import (
+    Trajectory,
+    displace,
+    line,
+    load_trajectory,
+    resample,
+    save_trajectory,
+    semicircle,
+    wave,
+)
+
+__version__ = "0.1.0"
+__all__ = [name for name in dir() if not name.startswith("_")]

@@ -1,0 +1,19 @@
+"""`tdf convert`: a PyTorch NDF checkpoint -> weights that `--weights` and `load_model` take."""
+
+from tdf_jax.checkpoint import save_model
+from tdf_jax.convert import convert_checkpoint
+from tdf_jax.network import parameter_count
+
+
+def convert(source: str, target: str) -> None:
+    """Convert a published Neural Descriptor Fields checkpoint; nothing in it is executed.
+
+    Args:
+        source: the PyTorch file, `.pth`.
+        target: the file to write, `.safetensors`.
+    """
+    model = convert_checkpoint(source)
+    save_model(model, target)
+    print(f"parameters   {parameter_count(model.config):,}")
+    print(f"latent size  {model.config.latent}")
+    print(f"saved        {target}")

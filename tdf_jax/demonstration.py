@@ -1,0 +1,107 @@
+"""A demonstration, and the reference that an imitation is compared with."""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from tdf_jax.descriptor import trajectory_descriptor
+from tdf_jax.errors import InputError
+from tdf_jax.model import Model, encode
+from tdf_jax.pointcloud import check_points, thin
+from tdf_jax.trajectory import Trajectory, check_trajectory
+
+
+@dataclasses.dataclass(frozen=True)
+class Demonstration:
+    """One trajectory shown on one object.
+
+    Attributes:
+        points: the object's cloud, (points, 3), metres, world frame.
+        trajectory: poses of the query frame from the pick (index 0) to the place (last).
+        query: query points in the query frame, (queries, 3), metres.
+
+    Raises:
+        InputError: bad points, or query points that are not (queries, 3) and finite.
+    """
+
+    points: Float[Array, "points 3"]
+    trajectory: Trajectory
+    query: Float[Array, "queries 3"]
+
+    def __post_init__(self):
+        check_points(self.points, "the demonstration's points")
+        if not isinstance(self.trajectory, Trajectory):
+            raise InputError(
+                f"Demonstration(): trajectory is a {type(self.trajectory).__name__}; expected a Trajectory, such as tdf.wave()"
+            )
+        check_trajectory(self.trajectory)
+        check_query("Demonstration()", self.query)
+
+
+@functools.partial(jax.tree_util.register_dataclass, data_fields=["descriptors", "trajectory", "query"], meta_fields=[])
+@dataclasses.dataclass(frozen=True)
+class Reference:
+    """What one or several demonstrations ask for, on any object of the category.
+
+    Attributes:
+        descriptors: phi of the demonstration, (poses, queries, channels); of several, their mean, as in NDF.
+        trajectory: T_object_query, relative to the demonstration's centroid with world axes; of several, the first's.
+        query: query points in the query frame, metres.
+    """
+
+    descriptors: Float[Array, "poses queries channels"]
+    trajectory: Trajectory
+    query: Float[Array, "queries 3"]
+
+
+def describe(model: Model, demonstrations: Demonstration | Sequence[Demonstration]) -> Reference:
+    """Encode one or several demonstrations.
+
+    Args:
+        model: the network.
+        demonstrations: one, or several with the same query points and number of poses.
+
+    Returns:
+        The reference.
+
+    Raises:
+        InputError: no demonstration, or demonstrations that differ in query points or number of poses.
+    """
+    if isinstance(demonstrations, Demonstration):
+        demonstrations = (demonstrations,)
+    if not demonstrations:
+        raise InputError("describe(): there are no demonstrations; expected at least one")
+    first = demonstrations[0]
+    for other in demonstrations[1:]:
+        if other.trajectory.poses != first.trajectory.poses or not np.array_equal(other.query, first.query):
+            raise InputError(
+                "describe(): demonstrations differ in their query points or number of poses; expected the same. "
+                "Use one query set and resample() the trajectories"
+            )
+    query = jnp.asarray(first.query)
+    fields = [encode(model, thinned(model, demo.points)) for demo in demonstrations]
+    descriptors = sum(_describe(field, demo.trajectory, query) for field, demo in zip(fields, demonstrations)) / len(fields)
+    return Reference(descriptors, first.trajectory.shifted(-fields[0].origin), query)
+
+
+_describe = jax.jit(trajectory_descriptor)
+
+
+def thinned(model: Model, points: Float[Array, "points 3"]) -> Float[Array, "points 3"]:
+    """The points at the density the network was trained on; all of them where it is not known."""
+    count = model.info.cloud_points
+    return points if count is None else thin(np.asarray(check_points(points)), count)
+
+
+def check_query(function: str, query) -> None:
+    """Raise InputError unless query points are (queries, 3), at least one, and finite."""
+    shape = np.shape(query)
+    if len(shape) != 2 or shape[1] != 3 or shape[0] < 1:
+        raise InputError(f"{function}: query points have shape {shape}; expected (queries, 3). Try tdf.box_query(key, count=500)")
+    if not isinstance(query, jax.core.Tracer) and not np.isfinite(np.asarray(query)).all():
+        raise InputError(f"{function}: some query points are NaN or infinite; expected finite metres")

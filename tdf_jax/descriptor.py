@@ -1,0 +1,34 @@
+"""Descriptors of poses and trajectories: the point descriptors of the query points they carry."""
+
+import jax
+from jaxtyping import Array, Float
+
+from tdf_jax import poses
+from tdf_jax.field import DescriptorField
+from tdf_jax.trajectory import Trajectory
+
+
+def pose_descriptor(
+    field: DescriptorField, T_world_query: Float[Array, "7"], query: Float[Array, "queries 3"]
+) -> Float[Array, "queries channels"]:
+    """F(T | P): descriptors of the query points at one pose.
+
+    Args:
+        field: the object's.
+        T_world_query: pose of the query frame, `wxyz_xyz`.
+        query: points in the query frame, metres.
+    """
+    return field.descriptors(poses.transform(T_world_query, query))
+
+
+def trajectory_descriptor(
+    field: DescriptorField, trajectory: Trajectory, query: Float[Array, "queries 3"]
+) -> Float[Array, "poses queries channels"]:
+    """phi(T | P): pose descriptors of every waypoint (eq. 1 of the TDF paper).
+
+    Args:
+        field: the object's.
+        trajectory: poses of the query frame.
+        query: points in the query frame, metres.
+    """
+    return jax.lax.map(lambda T_world_query: pose_descriptor(field, T_world_query, query), trajectory.wxyz_xyz)

@@ -1,0 +1,152 @@
+"""Energies of one trajectory: how far it is from the demonstration's (eq. 2, 3 and 6 of the TDF paper).
+
+Each function takes one trajectory; batches are made outside. The energy is a mean over poses of terms of one pose each, plus
+eq. 6, which couples neighbours: `optimize` uses that to hold one chunk of descriptors at a time.
+"""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from tdf_jax import poses
+from tdf_jax.demonstration import Reference
+from tdf_jax.errors import InputError
+from tdf_jax.field import DescriptorField
+from tdf_jax.trajectory import Trajectory
+
+POSE_NORMS = ("frobenius", "metres_radians")
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass, data_fields=["correlation", "compensator", "lever"], meta_fields=["pose_norm"]
+)
+@dataclasses.dataclass(frozen=True)
+class EnergyWeights:
+    """Weights of the terms; traced, so changing a number does not compile again.
+
+    Attributes:
+        correlation: k of eq. 3; the paper's best is 0.02.
+        compensator: weight of eq. 6, which the paper tried and rejected.
+        lever: metres that a turn of one unit counts as in eq. 3. The paper adds rotations to translations as they are, with objects
+            about one unit in size; at 1 m, a turn outweighs the descriptors of a real, 0.1 m mug by far, and a mug that lies
+            in another orientation is not followed (measured in docs/energy.md). 1.0 gives the plain norm.
+        pose_norm: the norm of eq. 3, which the paper does not specify: "frobenius", of the difference of the 4x4 matrices,
+            or "metres_radians", sqrt(distance^2 + angle^2).
+
+    Raises:
+        InputError: a negative weight or an unknown norm.
+    """
+
+    correlation: Float[Array, ""] | float = 0.02
+    compensator: Float[Array, ""] | float = 0.0
+    lever: Float[Array, ""] | float = 0.05
+    pose_norm: str = "frobenius"
+
+    def __post_init__(self):
+        if self.pose_norm not in POSE_NORMS:
+            raise InputError(f"EnergyWeights(): pose_norm is {self.pose_norm!r}; expected one of {', '.join(POSE_NORMS)}")
+        for name in ("correlation", "compensator", "lever"):
+            value = getattr(self, name)
+            if isinstance(value, int | float | np.number) and not 0 <= value < np.inf:
+                raise InputError(f"EnergyWeights(): {name} is {value}; expected a finite number of 0 or more")
+
+
+def trajectory_energy(
+    trajectory: Trajectory, field: DescriptorField, reference: Reference, weights: EnergyWeights
+) -> Float[Array, ""]:
+    """The energy that imitation minimises: eq. 3, and eq. 6 where it has a weight.
+
+    Args:
+        trajectory: poses of the query frame in the world.
+        field: the new object's.
+        reference: the demonstration's.
+        weights: of the terms.
+    """
+    return descriptor_loss(trajectory, field, reference) + pose_energy(trajectory, field.origin, reference, weights)
+
+
+def descriptor_loss(trajectory: Trajectory, field: DescriptorField, reference: Reference) -> Float[Array, ""]:
+    """l_t of eq. 2: mean absolute difference of descriptors over poses, queries and channels."""
+
+    def one(pose):
+        T_world_query, descriptors = pose
+        R, t = poses.rotation(T_world_query), poses.translation(T_world_query)
+        return waypoint_loss(R, t, field, reference.query, descriptors)
+
+    return jnp.mean(jax.lax.map(one, (trajectory.wxyz_xyz, reference.descriptors)))
+
+
+def waypoint_loss(
+    R: Float[Array, "3 3"],
+    t: Float[Array, "3"],
+    field: DescriptorField,
+    query: Float[Array, "queries 3"],
+    descriptors: Float[Array, "queries channels"],
+) -> Float[Array, ""]:
+    """One waypoint's part of eq. 2: mean absolute difference over queries and channels.
+
+    Args:
+        R, t: pose of the query frame in the world.
+        field: the new object's.
+        query: points in the query frame, metres.
+        descriptors: the demonstration's, of the same waypoint.
+    """
+    return jnp.mean(jnp.abs(field.descriptors(poses.rotate(R, query) + t) - descriptors))
+
+
+def pose_energy(
+    trajectory: Trajectory, origin: Float[Array, "3"], reference: Reference, weights: EnergyWeights
+) -> Float[Array, ""]:
+    """What the energy adds to eq. 2: the weighted terms that depend on the poses alone."""
+    correlation = correlation_loss(trajectory, origin, reference, weights.lever, weights.pose_norm)
+    return weights.correlation * correlation + weights.compensator * compensator_loss(trajectory)
+
+
+def correlation_loss(
+    trajectory: Trajectory,
+    origin: Float[Array, "3"],
+    reference: Reference,
+    lever: Float[Array, ""] | float = 1.0,
+    pose_norm: str = "frobenius",
+) -> Float[Array, ""]:
+    """l_c of eq. 3: mean over waypoints of ||T_ref - T||, on poses relative to each cloud's centroid with world axes.
+
+    It follows the object's translation and not its rotation, which is the paper's limit.
+
+    Args:
+        trajectory: poses of the query frame in the world.
+        origin: centroid of the new object's cloud, metres, world frame.
+        reference: the demonstration's.
+        lever, pose_norm: see `EnergyWeights`; by default the plain Frobenius norm of the 4x4 matrices.
+    """
+    target = reference.trajectory
+    shift = trajectory.translations - origin - target.translations
+    if pose_norm == "metres_radians":
+        turn = poses.rotation_distance(trajectory.rotations, target.rotations)[:, None]
+    else:
+        turn = (trajectory.rotations - target.rotations).reshape(-1, 9)
+    return jnp.mean(_norm(jnp.concatenate([shift, lever * turn], axis=-1)))
+
+
+def compensator_loss(trajectory: Trajectory, order: str = "frobenius") -> Float[Array, ""]:
+    """l_p of eq. 6: sum over neighbouring waypoints of ||T_i^-1 T_{i+1} - I||_F.
+
+    Args:
+        trajectory: poses of the query frame.
+        order: "frobenius", summed over pairs as in eq. 6, or "infinity", the largest of them.
+    """
+    steps = poses.compose(poses.inverse(trajectory.wxyz_xyz[:-1]), trajectory.wxyz_xyz[1:])
+    turn = (poses.rotation(steps) - jnp.eye(3, dtype=steps.dtype)).reshape(-1, 9)
+    lengths = _norm(jnp.concatenate([poses.translation(steps), turn], axis=-1))
+    return jnp.max(lengths) if order == "infinity" else jnp.sum(lengths)
+
+
+def _norm(x):
+    """Euclidean norm over the last axis, with gradient zero at zero: a fixed last pose is often exactly the reference's."""
+    squared = jnp.sum(x * x, axis=-1)
+    zero = squared == 0
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))

@@ -1,0 +1,1 @@
+"""Cases with known truth, errors and success rates."""

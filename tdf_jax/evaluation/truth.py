@@ -1,0 +1,60 @@
+"""What an imitation ought to be, where both objects carry semantic frames, and how far a pose is from it."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from tdf_jax import poses
+from tdf_jax.trajectory import Trajectory
+
+FLIP_DEGREES = 170.0  # rotation errors above it are counted apart: the object was taken for its mirror image
+
+
+def expected_trajectory(
+    demonstrated: Trajectory,
+    T_world_place_a: Float[np.ndarray, "4 4"],
+    T_world_place_b: Float[np.ndarray, "4 4"],
+    goal: Float[Array, "7"],
+) -> Trajectory:
+    """The demonstrated trajectory as it ought to be on another object.
+
+    With A the motion of the semantic place (say, the handle) from object a to object b, and G that of the last pose to the
+    goal, waypoint i of n is moved by B_i at s = i / (n - 1): its rotation is the geodesic from A's to G's at s, and the
+    waypoint is carried to the point at s on the line between where A and where G would carry it. The first is the pick,
+    A T_0; the last is the goal.
+
+    Args:
+        demonstrated: T_world_query on object a.
+        T_world_place_a: frame of the place on object a.
+        T_world_place_b: frame of the same place on object b.
+        goal: last pose on object b, `wxyz_xyz`.
+
+    Returns:
+        T_world_query on object b.
+    """
+    pick_motion = jnp.asarray(T_world_place_b @ np.linalg.inv(T_world_place_a), demonstrated.wxyz_xyz.dtype)
+    goal_motion = poses.compose(goal, poses.inverse(demonstrated.wxyz_xyz[-1]))
+    n = demonstrated.poses
+    s = jnp.arange(n) / (n - 1)
+    turn = poses.geodesic(pick_motion[:3, :3], poses.rotation(goal_motion), s)
+    t = demonstrated.translations
+    at_pick = poses.rotate(pick_motion[:3, :3], t) + pick_motion[:3, 3]
+    at_goal = poses.transform(goal_motion, t)
+    carried = (1 - s)[:, None] * at_pick + s[:, None] * at_goal
+    return Trajectory(poses.pose(jnp.matmul(turn, demonstrated.rotations), carried))
+
+
+def pose_error(found: Float[Array, "... 7"], truth: Float[Array, "... 7"]) -> tuple[np.ndarray, np.ndarray]:
+    """Distance of translations, metres, and of rotations, radians.
+
+    Args:
+        found, truth: poses `wxyz_xyz`; batch axes broadcast.
+    """
+    found, truth = jnp.asarray(found), jnp.asarray(truth)
+    distance = jnp.linalg.norm(poses.translation(found) - poses.translation(truth), axis=-1)
+    return np.asarray(distance), np.asarray(poses.rotation_distance(poses.rotation(found), poses.rotation(truth)))
+
+
+def path_error(found: Trajectory, truth: Trajectory) -> float:
+    """Mean distance of waypoints, metres."""
+    return float(np.mean(pose_error(found.wxyz_xyz, truth.wxyz_xyz)[0]))

@@ -1,0 +1,102 @@
+"""Imitation, the whole way in one call: demonstration + new object's cloud -> trajectory."""
+
+from collections.abc import Callable, Iterable, Sequence
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from tdf_jax.demonstration import Demonstration, Reference, describe, thinned
+from tdf_jax.energy import EnergyWeights
+from tdf_jax.errors import InputError
+from tdf_jax.model import Model, encode
+from tdf_jax.optimize import OptimizeConfig, Result, default_goal, optimize
+
+
+def imitate(
+    model: Model,
+    demonstration: Demonstration | Sequence[Demonstration] | Reference,
+    points: Float[Array, "points 3"],
+    *,
+    key: PRNGKeyArray,
+    goal: Float[Array, "7"] | None = None,
+    goal_offset: Float[Array, "3"] | None = None,
+    fix_last: bool = True,
+    energy: EnergyWeights = EnergyWeights(),
+    config: OptimizeConfig = OptimizeConfig(),
+    progress: Callable | None = None,
+) -> Result:
+    """Imitate a demonstrated trajectory on a new object of the same category.
+
+    Clouds denser than the network's training clouds are thinned by farthest points (`model.info.cloud_points`).
+
+    Args:
+        model: the network.
+        demonstration: one, several with the same query points, or a `Reference` from `describe` to share between calls.
+        points: the new object's cloud, (points, 3), metres, world frame.
+        key: random key, such as `jax.random.key(0)`; the result is a function of it.
+        goal: last pose, T_world_query as `wxyz_xyz`; by default the demonstration's last pose, carried by the centroids.
+        goal_offset: world vector added to the goal's translation, metres.
+        fix_last: keep the last pose at the goal.
+        energy: weights of the terms.
+        config: settings of the optimiser.
+        progress: see `optimize`.
+
+    Returns:
+        Every start's result; `.trajectory` is the best one, T_world_query.
+
+    Raises:
+        InputError: bad points, goal or offset.
+    """
+    reference = demonstration if isinstance(demonstration, Reference) else describe(model, demonstration)
+    field = encode(model, thinned(model, points))
+    goal = default_goal(field, reference) if goal is None else _finite("goal", goal, (7,))
+    if goal_offset is not None:
+        goal = goal.at[4:].add(_finite("goal_offset", goal_offset, (3,)))
+    return optimize(
+        field, reference, key, goal=goal, fix_last=fix_last, energy=energy, config=config, progress=progress
+    )
+
+
+def imitate_batch(
+    model: Model,
+    demonstration: Demonstration | Sequence[Demonstration] | Reference,
+    clouds: Iterable[Float[Array, "points 3"]],
+    *,
+    key: PRNGKeyArray,
+    **settings,
+) -> list[Result]:
+    """Imitate on many new objects with one compiled program.
+
+    The demonstration is encoded once. Targets run one after the other: one target's starts already fill the machine, and
+    memory does not grow with the number of targets.
+
+    Args:
+        model, demonstration: as for `imitate`.
+        clouds: one cloud a target, (points, 3), metres, world frame; sizes may differ.
+        key: random key; target i uses `jax.random.fold_in(key, i)`.
+        settings: as for `imitate`, shared by all targets.
+
+    Returns:
+        One result a target, in order.
+
+    Raises:
+        InputError: no clouds, or as for `imitate`.
+    """
+    clouds = list(clouds)
+    if not clouds:
+        raise InputError("imitate_batch(): there are no clouds; expected at least one")
+    reference = demonstration if isinstance(demonstration, Reference) else describe(model, demonstration)
+    return [
+        imitate(model, reference, points, key=jax.random.fold_in(key, index), **settings)
+        for index, points in enumerate(clouds)
+    ]
+
+
+def _finite(name, value, shape):
+    value = jnp.asarray(value, dtype=float)
+    if value.shape != shape:
+        raise InputError(f"imitate(): {name} has shape {value.shape}; expected {shape}")
+    if not jnp.isfinite(value).all():
+        raise InputError(f"imitate(): {name} is {value}; expected finite numbers")
+    return value

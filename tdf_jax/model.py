@@ -1,0 +1,90 @@
+"""A trained network: its parameters, its sizes and where it came from."""
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from tdf_jax.field import DescriptorField
+from tdf_jax.network import NetworkConfig, condition, encode_latent
+from tdf_jax.pointcloud import check_points
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelInfo:
+    """Where a network came from.
+
+    Attributes:
+        name: short name, such as "mug".
+        source: what made it: a training run, or the file it was converted from.
+        cloud_points: farthest points of the clouds it was trained on; None if unknown.
+        description: anything else worth knowing.
+    """
+
+    name: str
+    source: str
+    cloud_points: int | None = None
+    description: str = ""
+
+
+@functools.partial(jax.tree_util.register_dataclass, data_fields=["params"], meta_fields=["config", "info"])
+@dataclasses.dataclass(frozen=True, eq=False)
+class Model:
+    """An occupancy network; a pytree whose leaves are its parameters.
+
+    Attributes:
+        params: nested dictionaries of arrays, under the names of `network.parameter_shapes`.
+        config: the network's sizes.
+        info: where it came from.
+    """
+
+    params: dict
+    config: NetworkConfig
+    info: ModelInfo
+
+
+def shape_problems(found: Mapping[str, tuple[int, ...]], expected: Mapping[str, tuple[int, ...]]) -> str:
+    """Every tensor that is missing, not expected or of another shape, by name; empty if there is none."""
+    missing = [f"{name} {shape}" for name, shape in expected.items() if name not in found]
+    extra = [f"{name} {shape}" for name, shape in found.items() if name not in expected]
+    misshapen = [
+        f"{name} is {found[name]}, expected {shape}"
+        for name, shape in expected.items()
+        if name in found and found[name] != shape
+    ]
+    groups = {"missing": missing, "not expected": extra, "of another shape": misshapen}
+    return "; ".join(f"{len(names)} {what}: {', '.join(names)}" for what, names in groups.items() if names)
+
+
+def value_problems(tensors: Mapping[str, np.ndarray]) -> str:
+    """Every tensor that holds NaN or infinity, by name; empty if there is none."""
+    return ", ".join(name for name, tensor in tensors.items() if not np.isfinite(tensor).all())
+
+
+def encode(model: Model, points: Float[Array, "points 3"]) -> DescriptorField:
+    """Encode an object's point cloud into its descriptor field.
+
+    The points are used as they are, each of them. The field is best where they are as dense as in training: thin a dense
+    cloud to `model.info.cloud_points` with `pointcloud.thin`, as `imitate` does.
+
+    Args:
+        model: the network.
+        points: at least 21, metres, world frame.
+
+    Returns:
+        The field, in the world frame; it moves and turns with the points exactly.
+
+    Raises:
+        InputError: the points are fewer than 21, not (points, 3), not finite or all equal.
+    """
+    return _encode(model.params, model.config, jnp.asarray(check_points(points)))
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _encode(params, config, points):
+    origin = jnp.mean(points, axis=0)
+    return DescriptorField(condition(params, config, encode_latent(params, config, points - origin)), origin)

@@ -1,0 +1,294 @@
+"""Trajectory optimisation: Adam on SO(3) x R^3, many random starts in one compiled program.
+
+The energy is a mean over poses, so (starts x poses) are one list of independent poses. It is walked in chunks, each giving its
+losses and six-number gradients before the next begins: memory does not grow with the number of starts, and no more than
+`chunk` x queries descriptors exist at a time.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from tdf_jax import poses
+from tdf_jax.demonstration import Reference
+from tdf_jax.energy import EnergyWeights, pose_energy, waypoint_loss
+from tdf_jax.errors import InputError
+from tdf_jax.field import DescriptorField
+from tdf_jax.trajectory import Trajectory, check_trajectory
+
+STARTS = ("carried", "scattered")
+# About 512 descriptors of 2049 numbers (4 MB) with their activations stay in a core's cache.
+CHUNK_POINTS = 512
+BLOCK = 20  # iterations of one compiled call: progress and cancellation between them cost nothing measurable
+
+
+@dataclasses.dataclass(frozen=True)
+class OptimizeConfig:
+    """Settings of the optimiser.
+
+    Attributes:
+        inits: random starts, M.
+        iterations: Adam steps; the paper uses 100.
+        learning_rate: first step size, in radians and metres alike.
+        final_rate: last step size over the first; the rate falls as a cosine.
+        start: "carried" turns the whole demonstrated trajectory about the object's centroid, by one uniform rotation a start;
+            "scattered" draws each pose on its own, as the paper does: a uniform rotation, and a place uniform in a ball
+            of `start_radius` about the centroid.
+        start_radius: metres, for "scattered".
+        chunk: poses evaluated at a time; None chooses. Changes speed and memory, not the result.
+    """
+
+    inits: int = 10
+    iterations: int = 100
+    learning_rate: float = 0.02
+    final_rate: float = 0.05
+    start: str = "carried"
+    start_radius: float = 0.1
+    chunk: int | None = None
+
+    def __post_init__(self):
+        for name in ("inits", "iterations", "chunk"):
+            value = getattr(self, name)
+            if value is None and name == "chunk":
+                continue
+            if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
+                raise InputError(f"OptimizeConfig(): {name} is {value!r}; expected a whole number of at least 1")
+        for name in ("learning_rate", "final_rate", "start_radius"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise InputError(f"OptimizeConfig(): {name} is {getattr(self, name)}; expected a positive number")
+        if self.start not in STARTS:
+            raise InputError(f"OptimizeConfig(): start is {self.start!r}; expected one of {', '.join(STARTS)}")
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass, data_fields=["trajectories", "losses", "energies", "starts"], meta_fields=[]
+)
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """What every start came to.
+
+    Attributes:
+        trajectories: (inits, poses, 7), `wxyz_xyz`, T_world_query.
+        losses: (inits, iterations), the energy before each step; the first column is the start's.
+        energies: (inits,), the energy of `trajectories`, after the last step.
+        starts: (inits, poses, 7), where they began.
+    """
+
+    trajectories: Float[Array, "inits poses 7"]
+    losses: Float[Array, "inits iterations"]
+    energies: Float[Array, "inits"]
+    starts: Float[Array, "inits poses 7"]
+
+    @property
+    def finite(self) -> Bool[np.ndarray, "inits"]:
+        """Which starts stayed finite."""
+        return np.isfinite(self.energies) & np.isfinite(self.trajectories).all(axis=(1, 2))
+
+    @property
+    def best(self) -> int:
+        """Index of the finite start with the least energy.
+
+        Raises:
+            InputError: no start stayed finite.
+        """
+        if not self.finite.any():
+            raise InputError(f"Result.best: {self.status}; lower the learning rate, or check the weights and the query points")
+        return int(np.argmin(np.where(self.finite, self.energies, np.inf)))
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The best trajectory."""
+        return Trajectory(self.trajectories[self.best])
+
+    @property
+    def loss(self) -> float:
+        """Energy of the best trajectory."""
+        return float(self.energies[self.best])
+
+    @property
+    def status(self) -> str:
+        """How the starts ended, in words."""
+        failed = np.flatnonzero(~self.finite)
+        if len(failed) == 0:
+            return f"all {len(self.energies)} starts finite"
+        return f"{len(failed)} of {len(self.energies)} starts became non-finite: {', '.join(map(str, failed))}"
+
+
+def optimize(
+    field: DescriptorField,
+    reference: Reference,
+    key: PRNGKeyArray,
+    *,
+    goal: Float[Array, "7"] | None = None,
+    fix_last: bool = True,
+    energy: EnergyWeights = EnergyWeights(),
+    config: OptimizeConfig = OptimizeConfig(),
+    starts: Float[Array, "inits poses 7"] | None = None,
+    progress: Callable[[int, Float[np.ndarray, "inits"]], None] | None = None,
+) -> Result:
+    """Minimise `trajectory_energy` from many starts.
+
+    Each pose turns about the mean of the query points, so that turning does not move them away; results are about the query
+    frame's origin all the same. Start m is a function of the key and m.
+
+    Args:
+        field: the new object's.
+        reference: the demonstration's.
+        key: random key of the starts.
+        goal: last pose of every start, T_world_query; by default the demonstration's, carried by the centroids.
+        fix_last: keep the last pose at the goal; otherwise it starts there and is free.
+        energy: weights of the terms.
+        config: settings.
+        starts: use these instead of random ones; their last poses are replaced by the goal.
+        progress: called between blocks of iterations with the iterations done and the energies; may raise to cancel.
+
+    Returns:
+        All starts' results.
+
+    Raises:
+        InputError: starts or goal of a wrong shape.
+    """
+    goal = default_goal(field, reference) if goal is None else jnp.asarray(goal)
+    if goal.shape != (7,):
+        raise InputError(f"optimize(): goal has shape {goal.shape}; expected one pose wxyz_xyz, (7,)")
+    if starts is None:
+        starts = random_starts(key, field, reference, config.inits, config.start, config.start_radius)
+    starts = jnp.asarray(starts)
+    if starts.ndim != 3 or starts.shape[1:] != (reference.trajectory.poses, 7):
+        raise InputError(
+            f"optimize(): starts have shape {starts.shape}; expected (inits, {reference.trajectory.poses}, 7), "
+            "as many poses as the demonstration has"
+        )
+    starts = starts.at[:, -1].set(goal)
+    check_trajectory(Trajectory(starts.reshape(-1, 7)), "starts")
+    count = config.chunk or max(1, CHUNK_POINTS // len(reference.query))
+    program = functools.partial(_run, fix_last=fix_last, chunk=count)
+    rates = jnp.asarray([config.learning_rate, config.final_rate, config.iterations], starts.dtype)
+    state, losses = _begin(starts, reference.query), []
+    for done in range(0, config.iterations, BLOCK):
+        steps = min(BLOCK, config.iterations - done)
+        state, block = program(state, starts, field, reference, energy, rates, steps)
+        losses.append(block[:, :steps])
+        if progress is not None:
+            progress(done + steps, np.asarray(block[:, steps - 1]))
+    trajectories, energies = _finish(state, starts, field, reference, energy, fix_last=fix_last, chunk=count)
+    return Result(trajectories, jnp.concatenate(losses, axis=1), energies, starts)
+
+
+def default_goal(field: DescriptorField, reference: Reference) -> Float[Array, "7"]:
+    """The demonstration's last pose, carried by the centroids."""
+    return reference.trajectory.shifted(field.origin).wxyz_xyz[-1]
+
+
+def random_starts(
+    key: PRNGKeyArray, field: DescriptorField, reference: Reference, inits: int, start: str, radius: float
+) -> Float[Array, "inits poses 7"]:
+    """Random trajectories in the world; start m depends on the key and m alone. See `OptimizeConfig`."""
+    return jax.vmap(lambda m: _start(jax.random.fold_in(key, m), field.origin, reference, start, radius))(jnp.arange(inits))
+
+
+def _start(key, origin, reference, start, radius):
+    n, dtype = reference.trajectory.poses, reference.trajectory.wxyz_xyz.dtype
+    turn_key, place_key = jax.random.split(key)
+    if start == "carried":
+        turn = poses.uniform_rotations(turn_key, 1)[0].astype(dtype)
+        return reference.trajectory.transformed(poses.pose(turn, origin)).wxyz_xyz
+    place = jax.random.ball(place_key, 3, shape=(n,), dtype=dtype) * radius
+    R = poses.uniform_rotations(turn_key, n).astype(dtype)
+    centre = jnp.mean(reference.query, axis=0)
+    return poses.pose(R, origin + place - poses.rotate(R, centre[None])[:, 0])
+
+
+@jax.jit
+def _begin(starts, query):
+    """Optimiser state: rotation vectors away from the starts, places of the query centroid, Adam's moments, steps done."""
+    places = poses.transform(starts, jnp.mean(query, axis=0)[None])[..., 0, :]
+    variables = (jnp.zeros_like(places), places)
+    return variables, optax.scale_by_adam().init(variables), jnp.zeros((), jnp.int32)
+
+
+def _poses(variables, start_rotations, query):
+    """Rotations and translations (of the query frame's origin) of the variables."""
+    turn, place = variables
+    R = jnp.matmul(poses.exp(turn), start_rotations, precision=jax.lax.Precision.HIGHEST)
+    return R, place - poses.rotate(R, jnp.mean(query, axis=0)[None])[..., 0, :]
+
+
+@functools.partial(jax.jit, static_argnames=("fix_last", "chunk"), donate_argnums=0)
+def _run(state, starts, field, reference, energy, rates, steps, *, fix_last, chunk):
+    evaluate = _evaluator(starts, field, reference, energy, fix_last, chunk)
+    learning_rate, final_rate, iterations = rates
+
+    def step(i, carry):
+        (variables, adam, done), losses = carry
+        energies, gradient = evaluate(variables)
+        direction, adam = optax.scale_by_adam().update(gradient, adam)
+        cosine = 0.5 * (1 + jnp.cos(jnp.pi * done / iterations))
+        rate = learning_rate * (final_rate + (1 - final_rate) * cosine)
+        variables = jax.tree.map(lambda x, d: x - rate * d, variables, direction)
+        return (variables, adam, done + 1), losses.at[:, i].set(energies)
+
+    # The number of steps is traced, so the last, shorter block runs the same program.
+    return jax.lax.fori_loop(0, steps, step, (state, jnp.zeros((len(starts), BLOCK), starts.dtype)))
+
+
+@functools.partial(jax.jit, static_argnames=("fix_last", "chunk"))
+def _finish(state, starts, field, reference, energy, *, fix_last, chunk):
+    variables, _, _ = state
+    energies, _ = _evaluator(starts, field, reference, energy, fix_last, chunk)(variables)
+    wxyz_xyz = poses.pose(*_poses(variables, poses.rotation(starts), reference.query))
+    return wxyz_xyz.at[:, -1].set(starts[:, -1]) if fix_last else wxyz_xyz, energies
+
+
+def _evaluator(starts, field, reference, energy, fix_last, chunk):
+    """Function from variables to every start's energy and its gradient with respect to the variables.
+
+    Equal to `jax.vmap(jax.value_and_grad(trajectory_energy))`, but a chunk of poses at a time. A fixed last pose is evaluated once,
+    not in every step, and has gradient zero.
+    """
+    inits, n = starts.shape[:2]
+    free = n - 1 if fix_last else n
+    query = reference.query
+
+    def waypoint(variables, start_rotation, descriptors):
+        R, t = _poses(variables, start_rotation, query)
+        return waypoint_loss(R, t, field, query, descriptors)
+
+    def indexed(pose):
+        variables, start_rotation, index = pose
+        return jax.value_and_grad(waypoint)(variables, start_rotation, reference.descriptors[index])
+
+    start_rotations = poses.rotation(starts)
+    fixed = 0.0
+    if fix_last:
+        fixed = waypoint_loss(start_rotations[0, -1], starts[0, -1, 4:], field, query, reference.descriptors[-1])
+
+    def flat(x):
+        return x[:, :free].reshape(inits * free, *x.shape[2:])
+
+    def unflat(gradient):
+        gradient = gradient.reshape(inits, free, 3) / n
+        return jnp.concatenate([gradient, jnp.zeros((inits, n - free, 3), gradient.dtype)], axis=1)
+
+    def rest(variables, start_rotation):
+        R, t = _poses(variables, start_rotation, query)
+        return pose_energy(Trajectory(poses.pose(R, t)), field.origin, reference, energy)
+
+    def evaluate(variables):
+        indices = jnp.tile(jnp.arange(free), inits)
+        inputs = (jax.tree.map(flat, variables), flat(start_rotations), indices)
+        losses, gradient = jax.lax.map(indexed, inputs, batch_size=chunk)
+        remaining, remaining_gradient = jax.vmap(jax.value_and_grad(rest))(variables, start_rotations)
+        mask = (jnp.arange(n) < free)[:, None]
+        gradient = jax.tree.map(
+            lambda a, b: unflat(a) + jnp.where(mask, b, 0.0), gradient, remaining_gradient
+        )
+        return (losses.reshape(inits, free).sum(axis=1) + fixed) / n + remaining, gradient
+
+    return evaluate

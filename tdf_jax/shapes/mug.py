@@ -1,0 +1,503 @@
+"""Parametric mugs: watertight meshes with ground truth frames and an exact inside test.
+
+Canonical frame: z up along the mug's axis, the handle along +x, the origin on the axis at half the body's height.
+Every surface is flat between neighbouring rings, so `Mug.contains` decides by the very planes of the mesh: training
+labels and surface samples agree to rounding (3e-5 m along a flared handle), which no smooth formula would give.
+"""
+
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from numbers import Real
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from tdf_jax.errors import InputError
+
+if TYPE_CHECKING:
+    import trimesh
+
+HANDLE_STYLES = ("d", "ring", "ear", "square")
+
+_AROUND = 64  # polygon corners around the body; a multiple of 8, so a square mug keeps its corners
+_TUBE_AROUND = 16  # polygon corners around the handle's tube
+_TUBE_RINGS = 30  # rings along the handle
+_MAY_BE_ZERO = ("bulge", "edge_radius", "foot_height", "lip_radius")
+_DIMENSIONLESS = ("squareness", "handle_style", "handle_squareness", "handle_flare")
+
+
+@dataclass(frozen=True)
+class MugParameters:
+    """The dimensions of one mug, in metres unless stated otherwise; the defaults make a common 0.10 m mug.
+
+    Attributes:
+        height: of the body.
+        top_radius: outer radius at the rim; for square mugs half the side.
+        bottom_radius: outer radius at the bottom, before the edge is rounded.
+        bulge: added to the radius at half height, fading as a parabola; positive is a barrel, negative a waist.
+        squareness: superellipse exponent of the body's cross-section, 2 (round) to 20 (square); no unit.
+        wall_thickness: of the body's wall.
+        bottom_thickness: of the floor, above the recess of the foot.
+        edge_radius: rounding of the outer bottom edge.
+        foot_height: depth of the recess inside the foot ring; 0 for a flat bottom.
+        foot_width: radial width of the foot ring.
+        lip_radius: rounding of both edges of the rim; less than half the wall.
+        handle_style: "d" (straight bar, round ends), "ring" (part of an ellipse), "ear" (widest above the middle) or
+            "square" (straight bar and arms).
+        handle_top: height of the upper attachment above the bottom.
+        handle_bottom: height of the lower attachment above the bottom.
+        handle_reach: from the wider attachment on the wall to the centre line of the handle's bar.
+        handle_width: of the tube's section, across the mug's plane of symmetry.
+        handle_thickness: of the tube's section, in the mug's plane of symmetry.
+        handle_squareness: superellipse exponent of the tube's section, 2 (ellipse) to 20 (rectangle); no unit.
+        handle_flare: size of the tube's section at the wall over its size at the grip, 1 to 2; no unit.
+    """
+
+    height: float = 0.100
+    top_radius: float = 0.041
+    bottom_radius: float = 0.040
+    bulge: float = 0.0
+    squareness: float = 2.0
+    wall_thickness: float = 0.004
+    bottom_thickness: float = 0.005
+    edge_radius: float = 0.006
+    foot_height: float = 0.0
+    foot_width: float = 0.005
+    lip_radius: float = 0.0016
+    handle_style: str = "d"
+    handle_top: float = 0.082
+    handle_bottom: float = 0.024
+    handle_reach: float = 0.030
+    handle_width: float = 0.014
+    handle_thickness: float = 0.009
+    handle_squareness: float = 2.0
+    handle_flare: float = 1.15
+
+
+class _Solid(NamedTuple):
+    """A polygon of unit size (see `_polygon`) scaled by `radii` at `heights`, flat in between."""
+
+    heights: np.ndarray
+    radii: np.ndarray
+    squareness: float
+
+
+class _Tube(NamedTuple):
+    """A section swept along `line` (rings, 2) in the x-z plane, cut at each ring along its mitre (rings, 2).
+
+    The section is the unit polygon times `section` = half (thickness, width), and times `scales` (rings,).
+    """
+
+    line: np.ndarray
+    mitres: np.ndarray
+    scales: np.ndarray
+    section: np.ndarray
+    squareness: float
+
+
+class _Geometry(NamedTuple):
+    outer: _Solid
+    hollows: tuple[_Solid, ...]
+    tube: _Tube
+
+
+@dataclass(frozen=True, eq=False)
+class Mug:
+    """One mug with its ground truth; every frame is T_object_frame, a 4x4 matrix in metres.
+
+    Attributes:
+        mesh: watertight, normals outward; the clay only, the cavity is open.
+        parameters: what it was built from.
+        handle_frame: origin on the handle's centre line half way between the attachments, x outward, z up.
+        rim_frame: origin on top of the rim on the side opposite to the handle, x outward (object -x), z up.
+        base_frame: origin on the axis at the plane the mug stands on, x towards the handle, z up.
+        axis: unit vector up, in the object frame.
+    """
+
+    mesh: "trimesh.Trimesh"
+    parameters: MugParameters
+    handle_frame: Float[np.ndarray, "4 4"]
+    rim_frame: Float[np.ndarray, "4 4"]
+    base_frame: Float[np.ndarray, "4 4"]
+    axis: Float[np.ndarray, "3"]
+
+    @property
+    def frames(self) -> dict[str, Float[np.ndarray, "4 4"]]:
+        """The frames by name: handle, rim, base."""
+        return {"handle": self.handle_frame, "rim": self.rim_frame, "base": self.base_frame}
+
+    @cached_property
+    def _geometry(self) -> _Geometry:
+        return _geometry(self.parameters)
+
+    def contains(self, points: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:
+        """Tell which points lie in the clay, by the planes of the mesh (no ray casting).
+
+        Args:
+            points: (points, 3), metres, object frame.
+
+        Returns:
+            (points,) True inside.
+
+        Raises:
+            InputError: the points are not (points, 3), or not finite.
+        """
+        points = np.asarray(points)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise InputError(f"Mug.contains(): points have shape {points.shape}; expected (points, 3)")
+        if not np.isfinite(points).all():
+            raise InputError("Mug.contains(): points hold NaN or infinite numbers; expected finite metres; remove them")
+        outer, hollows, tube = self._geometry
+        clay = _in_solid(outer, points) | _in_tube(tube, points)
+        for hollow in hollows:
+            clay &= ~_in_solid(hollow, points)
+        return clay
+
+
+def build_mug(parameters: MugParameters = MugParameters()) -> Mug:
+    """Build the mesh and the ground truth of one mug.
+
+    Args:
+        parameters: its dimensions, metres.
+
+    Returns:
+        The mug in its canonical frame.
+
+    Raises:
+        InputError: the dimensions do not make a mug; the message names the one to change.
+    """
+    import trimesh
+
+    _check(parameters)
+    outer, hollows, tube = _geometry(parameters)
+    fast = {"engine": "manifold", "check_volume": False}  # the parts are closed by construction; the result is checked
+    clay = trimesh.boolean.union([_skin(_solid_rings(outer)), _skin(_tube_rings(tube))], **fast)
+    # The cavity is cut after the handle is joined: nothing of the handle is left inside it.
+    mesh = trimesh.boolean.difference([clay, *(_skin(_solid_rings(hollow)) for hollow in hollows)], **fast)
+    if not (mesh.is_volume and mesh.euler_number == 0 and mesh.body_count == 1):
+        raise InputError(f"build_mug(): the dimensions give no single closed cup with one handle; got {parameters}; "
+                         "expected walls and handle of a common mug: move them towards the defaults")
+    grip = _grip(tube, parameters)
+    rim = parameters.top_radius - parameters.wall_thickness / 2
+    half = parameters.height / 2
+    return Mug(mesh=mesh, parameters=parameters, axis=np.array([0.0, 0.0, 1.0]),
+               handle_frame=_frame(grip[0], grip[1], 1.0), rim_frame=_frame(-rim, half, -1.0),
+               base_frame=_frame(0.0, -half, 1.0))
+
+
+def scaled(mug: Mug, factor: float) -> Mug:
+    """Scale a mug uniformly about the origin: mesh, frames and parameters.
+
+    Args:
+        mug: the mug.
+        factor: positive, no unit.
+
+    Returns:
+        A new mug.
+
+    Raises:
+        InputError: the factor is not positive and finite.
+    """
+    if not (np.isfinite(factor) and factor > 0):
+        raise InputError(f"scaled(): factor is {factor}; expected a positive number")
+    lengths = [field.name for field in fields(MugParameters) if field.name not in _DIMENSIONLESS]
+    parameters = replace(mug.parameters, **{name: getattr(mug.parameters, name) * factor for name in lengths})
+    grow = np.ones((4, 4))
+    grow[:3, 3] = factor
+    frames = {f"{name}_frame": frame * grow for name, frame in mug.frames.items()}
+    return replace(mug, mesh=mug.mesh.copy().apply_scale(factor), parameters=parameters, **frames)
+
+
+def sample_mug(rng: np.random.Generator) -> MugParameters:
+    """Draw the dimensions of a mug 0.07 to 0.13 m tall: straight, tapered, barrel, waisted, square, every handle.
+
+    Args:
+        rng: the source of chance; the same state gives the same mug.
+
+    Returns:
+        Dimensions that `build_mug` accepts.
+    """
+    while True:  # about one draw in ten asks for a handle that does not fit its body
+        parameters = _draw(rng)
+        try:
+            _check(parameters)
+        except InputError:
+            continue
+        return parameters
+
+
+def _draw(rng: np.random.Generator) -> MugParameters:
+    def uniform(low, high):
+        return float(rng.uniform(low, high))
+
+    def chance(probability):
+        return rng.uniform() < probability
+
+    height = uniform(0.07, 0.13)
+    top = height * uniform(0.33, 0.63)
+    bottom = top * (uniform(0.96, 1.03) if chance(0.5) else uniform(0.65, 1.0))
+    wall = uniform(0.0025, 0.006)
+    thickness = uniform(0.006, 0.013)
+    return MugParameters(
+        height=height,
+        top_radius=top,
+        bottom_radius=bottom,
+        bulge=bottom * uniform(-0.08, 0.16) if chance(0.45) else 0.0,
+        squareness=uniform(2.5, 7.0) if chance(0.2) else 2.0,
+        wall_thickness=wall,
+        bottom_thickness=uniform(0.003, 0.008),
+        edge_radius=bottom * (uniform(0.03, 0.25) if chance(0.8) else uniform(0.25, 0.65)),
+        foot_height=uniform(0.001, 0.004) if chance(0.35) else 0.0,
+        foot_width=uniform(0.003, 0.006),
+        lip_radius=wall * uniform(0.15, 0.48),
+        handle_style=HANDLE_STYLES[rng.integers(len(HANDLE_STYLES))],
+        handle_top=height * uniform(0.68, 0.94),
+        handle_bottom=height * uniform(0.09, 0.38),
+        handle_reach=uniform(0.020, 0.042),
+        handle_width=thickness * uniform(0.8, 2.2),
+        handle_thickness=thickness,
+        handle_squareness=uniform(2.5, 7.0) if chance(0.4) else 2.0,
+        handle_flare=uniform(1.0, 1.5),
+    )
+
+
+def _check(parameters: MugParameters) -> None:
+    """Raise InputError unless the dimensions make one closed mug with one finger hole."""
+
+    def need(truth, what):
+        if not truth:
+            raise InputError(f"build_mug(): {what}; got {parameters}")
+
+    p = parameters
+    need(p.handle_style in HANDLE_STYLES, f"handle_style is {p.handle_style!r}; expected one of {HANDLE_STYLES}")
+    numbers = {field.name: getattr(p, field.name) for field in fields(p) if field.name != "handle_style"}
+    for name, value in numbers.items():
+        need(isinstance(value, Real) and np.isfinite(value), f"{name} is {value!r}; expected a finite number")
+        need(value > 0 or name in _MAY_BE_ZERO, f"{name} is {value}; expected a positive number")
+        need(value >= 0 or name == "bulge", f"{name} is {value}; expected zero or a positive number")
+    for name in ("squareness", "handle_squareness"):
+        need(2 <= numbers[name] <= 20, f"{name} is {numbers[name]}; expected 2 (round) to 20 (square)")
+    need(1 <= p.handle_flare <= 2, f"handle_flare is {p.handle_flare}; expected 1 to 2")
+    need(2 * p.lip_radius < p.wall_thickness, "lip_radius must be less than half of wall_thickness")
+    floor = p.foot_height + p.bottom_thickness
+    need(floor + _inner_edge(p) + p.lip_radius < p.height, "the bottom is too thick for the height")
+    need(p.edge_radius + p.lip_radius < p.height, "edge_radius is too large for the height")
+    levels = np.linspace(0, 1, 65) * p.height
+    need(np.min(_wall(p, levels)) > p.wall_thickness, "wall_thickness must be less than the radius at every height")
+    need(p.edge_radius < 0.9 * p.bottom_radius, "edge_radius must be less than 0.9 of bottom_radius")
+    need(_wall(p, floor) > p.wall_thickness + _inner_edge(p), "the cavity closes at its floor: thin the wall")
+    need(p.foot_height == 0 or p.edge_radius + p.foot_width < 0.95 * p.bottom_radius,
+         "foot_width leaves no recess: lower it or edge_radius")
+    size = p.handle_thickness * p.handle_flare
+    need(p.handle_top + size / 2 < p.height - p.lip_radius, "handle_top is above the body: lower it")
+    need(p.handle_bottom - size / 2 > 0, "handle_bottom is below the body: raise it")
+    need(p.handle_top - p.handle_bottom > 2 * size, "handle_top and handle_bottom are too close for the thickness")
+    need(p.handle_width * p.handle_flare < p.bottom_radius, "handle_width must be less than the radius")
+    _check_handle(p, need)
+
+
+def _check_handle(p: MugParameters, need) -> None:
+    outer, _, tube = _geometry(p)
+    rings = _tube_rings(tube)
+    need(rings[..., 2].min() > -p.height / 2, "the handle hangs below the bottom: raise handle_bottom")
+    buried = _in_solid(outer, np.concatenate([rings[0], rings[-1]])).all()
+    need(buried, "the handle does not end inside the body: move its attachments away from the rounded edge")
+    steps = np.diff(rings[..., [0, 2]], axis=0)
+    forward = np.einsum("smi,si->sm", steps, np.diff(tube.line, axis=0))
+    need((forward > 0).all(), "the handle bends more tightly than its thickness allows: thin it or move it out")
+    gap = tube.line[:, 0] - p.handle_thickness * tube.scales / 2 - _wall(p, tube.line[:, 1] + p.height / 2)
+    free = gap > 0.02 * p.height
+    need(np.abs(np.diff(free.astype(int))).sum() == 2, "the handle leaves no finger hole: raise handle_reach")
+
+
+def _wall(p: MugParameters, level):
+    """Outer radius at a level above the bottom, before edges are rounded."""
+    s = level / p.height
+    return p.bottom_radius + (p.top_radius - p.bottom_radius) * s + 4 * p.bulge * s * (1 - s)
+
+
+def _inner_edge(p: MugParameters) -> float:
+    """Rounding of the cavity's floor: concentric with the outer edge, so the corner is never thinner than the wall."""
+    return max(p.edge_radius - p.wall_thickness, p.wall_thickness / 2)
+
+
+def _inset(distance, radius: float):
+    """How far a quarter circle of this radius draws back at a distance from the end it rounds."""
+    return radius - np.sqrt(np.maximum(radius**2 - np.maximum(radius - distance, 0) ** 2, 0))
+
+
+def _levels(p: MugParameters, low: float, high: float, low_radius: float, high_radius: float) -> np.ndarray:
+    """Levels for the rings of a profile: close together along both roundings."""
+    quarter = 1 - np.cos(np.linspace(0, np.pi / 2, 6))
+    middle = np.linspace(low + low_radius, high - high_radius, 10)
+    levels = np.concatenate([low + low_radius * quarter, middle, high - high_radius * quarter])
+    return np.unique(np.round(levels / p.height, 9)) * p.height  # one level where parts meet
+
+
+def _geometry(p: MugParameters) -> _Geometry:
+    floor = p.foot_height + p.bottom_thickness
+    levels = _levels(p, 0.0, p.height, p.edge_radius, p.lip_radius)
+    radii = _wall(p, levels) - _inset(levels, p.edge_radius) - _inset(p.height - levels, p.lip_radius)
+    outer = _Solid(levels - p.height / 2, radii, p.squareness)
+    levels = _levels(p, floor, p.height, _inner_edge(p), p.lip_radius)
+    radii = _wall(p, levels) - p.wall_thickness
+    radii = radii - _inset(levels - floor, _inner_edge(p)) + _inset(p.height - levels, p.lip_radius)
+    above = np.append(levels, 1.5 * p.height)  # cut well past the rim, so no two faces coincide
+    cavity = _Solid(above - p.height / 2, np.append(radii, radii[-1]), p.squareness)
+    if p.foot_height == 0:
+        return _Geometry(outer, (cavity,), _tube(p))
+    inner = p.bottom_radius - p.edge_radius - p.foot_width
+    recess = _Solid(np.array([-p.height, p.foot_height - p.height / 2]), np.array([inner, inner]), p.squareness)
+    return _Geometry(outer, (cavity, recess), _tube(p))
+
+
+def _tube(p: MugParameters) -> _Tube:
+    line = _resample(_centre_line(p), _TUBE_RINGS)
+    share = np.linspace(-1, 1, len(line))
+    scales = 1 + (p.handle_flare - 1) * share**4
+    ends = np.stack([[0.4 * end[0], end[1]] for end in (line[0], line[-1])])  # buried: level, well inside the body
+    line = np.concatenate([ends[:1], line, ends[1:]])
+    scales = np.concatenate([scales[:1], scales, scales[-1:]])
+    section = np.array([p.handle_thickness, p.handle_width]) / 2
+    return _Tube(line, _mitres(line), scales, section, p.handle_squareness)
+
+
+def _centre_line(p: MugParameters) -> np.ndarray:
+    """The handle's centre line in the x-z plane from the upper to the lower attachment, in the middle of the wall."""
+    top, bottom = p.handle_top, p.handle_bottom
+    x_top, x_bottom = (float(_wall(p, level)) - p.wall_thickness / 2 for level in (top, bottom))
+    x_bar = max(x_top, x_bottom) + p.wall_thickness / 2 + p.handle_reach
+    half, middle = (top - bottom) / 2, (top + bottom) / 2 - p.height / 2
+    if p.handle_style in ("d", "square"):
+        radius = {"d": 0.98, "square": 0.5}[p.handle_style] * min(half, p.handle_reach)
+        turn = np.linspace(0, np.pi / 2, 40)
+        x, z = x_bar - radius * (1 - np.sin(turn)), middle + half - radius * (1 - np.cos(turn))
+        arms = np.array([[x_top, middle + half]]), np.array([[x_bottom, middle - half]])
+        return np.concatenate([arms[0], np.stack([x, z], 1), np.stack([x, 2 * middle - z], 1)[::-1], arms[1]])
+    t = np.linspace(0, 1, 160)
+    if p.handle_style == "ring":
+        centre = 0.35  # of the reach; the ellipse crosses the wall past its widest height
+        angle = (1 - 2 * t) * np.arccos(-centre / (1 - centre))
+        out, up = centre + (1 - centre) * np.cos(angle), np.sin(angle) / np.sin(angle[0])
+    else:
+        basis = np.stack([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t**2 * (1 - t), t**3], axis=1)
+        out, up = (basis @ np.array([[0.0, 1.0], [1.1, 1.45], [1.3, -0.3], [0.0, -1.0]])).T
+        out = out / out.max()
+    wall = x_bottom + (x_top - x_bottom) * (up + 1) / 2
+    return np.stack([wall + out * (x_bar - wall), middle + half * up], axis=1)
+
+
+def _grip(tube: _Tube, p: MugParameters) -> np.ndarray:
+    """The outermost point of the centre line half way between the attachments, (x, z)."""
+    height = (p.handle_top + p.handle_bottom - p.height) / 2
+    a, b = tube.line[:-1], tube.line[1:]
+    crossing = (a[:, 1] - height) * (b[:, 1] - height) <= 0
+    a, b = a[crossing], b[crossing]
+    share = (height - a[:, 1]) / (b[:, 1] - a[:, 1])
+    return np.array([np.max(a[:, 0] + share * (b[:, 0] - a[:, 0])), height])
+
+
+def _frame(x: float, z: float, outward: float) -> np.ndarray:
+    """T_object_frame at (x, 0, z), z up, its x axis along object x times `outward` (1 or -1)."""
+    frame = np.diag([outward, outward, 1.0, 1.0])
+    frame[:3, 3] = x, 0.0, z
+    return frame
+
+
+# The solids below know nothing of mugs: stacks of polygons, turned or swept, and their inside tests.
+
+
+def _polygon(exponent: float, count: int) -> np.ndarray:
+    """Corners (count, 2) on the unit superellipse at even angles, counter-clockwise from +x."""
+    angle = np.arange(count) * (2 * np.pi / count)
+    corners = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return corners / np.sum(np.abs(corners) ** exponent, axis=1, keepdims=True) ** (1 / exponent)
+
+
+def _gauge(flat: np.ndarray, exponent: float, count: int) -> np.ndarray:
+    """How much the polygon must grow to reach each point of `flat` (points, 2): 1 on its edges, as in the mesh."""
+    corners = _polygon(exponent, count)
+    edges = np.linalg.solve(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1), np.ones((count, 2, 1)))[..., 0]
+    sector = np.floor(np.arctan2(flat[:, 1], flat[:, 0]) * (count / (2 * np.pi))).astype(int) % count
+    return np.sum(edges[sector] * flat, axis=1)
+
+
+def _in_solid(solid: _Solid, points: np.ndarray) -> np.ndarray:
+    radius = np.interp(points[:, 2], solid.heights, solid.radii, left=-1.0, right=-1.0)
+    return _gauge(points[:, :2], solid.squareness, _AROUND) <= radius
+
+
+def _solid_rings(solid: _Solid) -> np.ndarray:
+    rings = solid.radii[:, None, None] * _polygon(solid.squareness, _AROUND)
+    heights = np.broadcast_to(solid.heights[:, None, None], (*rings.shape[:2], 1))
+    return np.concatenate([rings, heights], axis=-1)
+
+
+def _in_tube(tube: _Tube, points: np.ndarray) -> np.ndarray:
+    """Between the mitre planes of a step, and inside the section it has there."""
+    rings = _tube_rings(tube).reshape(-1, 3)
+    near = np.flatnonzero(np.all((points >= rings.min(axis=0)) & (points <= rings.max(axis=0)), axis=1))
+    flat, y = points[near][:, [0, 2]], points[near, 1]
+    forward = -_normal(tube.mitres)
+    past = flat @ forward.T - np.sum(tube.line * forward, axis=1)  # (near, rings), distance past each mitre plane
+    point, step = np.nonzero((past[:, :-1] >= 0) & (past[:, 1:] <= 0))
+    start, end = past[point, step], -past[point, step + 1]
+    share = start / np.maximum(start + end, np.finfo(float).tiny)
+    scale = tube.scales[step] + share * (tube.scales[step + 1] - tube.scales[step])
+    across = np.sum((flat[point] - tube.line[step]) * _normal(_directions(tube.line))[step], axis=1)
+    size = _gauge(np.stack([across, y[point]], axis=1) / tube.section, tube.squareness, _TUBE_AROUND)
+    inside = np.zeros(len(points), bool)
+    inside[near[point[size <= scale]]] = True
+    return inside
+
+
+def _tube_rings(tube: _Tube) -> np.ndarray:
+    section = _polygon(tube.squareness, _TUBE_AROUND) * tube.section
+    flat = tube.line[:, None] + tube.scales[:, None, None] * section[:, :1] * tube.mitres[:, None]
+    return np.stack([flat[..., 0], tube.scales[:, None] * section[:, 1], flat[..., 1]], axis=-1)
+
+
+def _mitres(line: np.ndarray) -> np.ndarray:
+    """The normal halving each bend, lengthened so that steps on both sides keep their thickness."""
+    normals = _normal(_directions(line))
+    before, after = np.concatenate([normals[:1], normals]), np.concatenate([normals, normals[-1:]])
+    return (before + after) / (1 + np.sum(before * after, axis=1, keepdims=True))
+
+
+def _directions(line: np.ndarray) -> np.ndarray:
+    steps = np.diff(line, axis=0)
+    return steps / np.linalg.norm(steps, axis=1, keepdims=True)
+
+
+def _normal(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (..., 2) of the x-z plane turned by 90 degrees, so that (turned, y, vector) is right-handed."""
+    return np.stack([vectors[..., 1], -vectors[..., 0]], axis=-1)
+
+
+def _resample(line: np.ndarray, count: int) -> np.ndarray:
+    """Place `count` points along a polyline, half by length and half by turning, so bends get short steps."""
+    knots = np.arange(len(line))
+    between = np.linspace(0, len(line) - 1, 8 * (len(line) - 1) + 1)
+    fine = np.stack([np.interp(between, knots, line[:, axis]) for axis in range(2)], axis=1)
+    steps = np.diff(fine, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    headings = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+    turns = np.abs(np.gradient(headings))
+    cost = np.concatenate([[0.0], np.cumsum(lengths / lengths.sum() + turns / turns.sum())])
+    at = np.linspace(0, cost[-1], count)
+    return np.stack([np.interp(at, cost, fine[:, axis]) for axis in range(2)], axis=1)
+
+
+def _skin(rings: np.ndarray) -> "trimesh.Trimesh":
+    """Close rings (rings, corners, 3), counter-clockwise about the way they go, with fans at both ends."""
+    import trimesh
+
+    count, corners = rings.shape[:2]
+    here = np.arange(count * corners).reshape(count, corners)
+    there = np.roll(here, -1, axis=1)
+    first, last = np.full(corners, count * corners), np.full(corners, count * corners + 1)
+    triangles = [(here[:-1], there[:-1], there[1:]), (here[:-1], there[1:], here[1:]),
+                 (there[0], here[0], first), (here[-1], there[-1], last)]
+    faces = np.concatenate([np.stack(corner, axis=-1).reshape(-1, 3) for corner in triangles])
+    return trimesh.Trimesh(np.concatenate([rings.reshape(-1, 3), rings[[0, -1]].mean(axis=1)]), faces, process=False)
