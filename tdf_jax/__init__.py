@@ -19,6 +19,7 @@ from tdf_jax.network import NetworkConfig
 from tdf_jax.optimize import OptimizeConfig, Result, optimize
 from tdf_jax.pointcloud import load_mesh, load_points, sample_surface, thin
 from tdf_jax.query import box_query, gaussian_query, gripper_query, lattice_query
+from tdf_jax.shapes import MugParameters, build_mug, sample_mug
 from tdf_jax.trajectory import (
     Trajectory,
     displace,

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tdf_jax.descriptor import trajectory_descriptor
+from tdf_jax.descriptor import check_query, trajectory_descriptor
 from tdf_jax.errors import InputError
 from tdf_jax.model import Model, encode
 from tdf_jax.pointcloud import check_points, thin
@@ -70,12 +70,12 @@ def describe(model: Model, demonstrations: Demonstration | Sequence[Demonstratio
         The reference.
 
     Raises:
-        InputError: no demonstration, or demonstrations that differ in query points or number of poses.
+        InputError: no demonstration, something else, or demonstrations that differ in query points or number of poses.
     """
-    if isinstance(demonstrations, Demonstration):
-        demonstrations = (demonstrations,)
-    if not demonstrations:
-        raise InputError("describe(): there are no demonstrations; expected at least one")
+    demonstrations = [demonstrations] if isinstance(demonstrations, Demonstration) else list(demonstrations)
+    kinds = sorted({type(demo).__name__ for demo in demonstrations})
+    if kinds != ["Demonstration"]:
+        raise InputError(f"describe(): got {', '.join(kinds) or 'nothing'}; expected one or more of tdf.Demonstration")
     first = demonstrations[0]
     for other in demonstrations[1:]:
         if other.trajectory.poses != first.trajectory.poses or not np.array_equal(other.query, first.query):
@@ -96,12 +96,3 @@ def thinned(model: Model, points: Float[Array, "points 3"]) -> Float[Array, "poi
     """The points at the density the network was trained on; all of them where it is not known."""
     count = model.info.cloud_points
     return points if count is None else thin(np.asarray(check_points(points)), count)
-
-
-def check_query(function: str, query) -> None:
-    """Raise InputError unless query points are (queries, 3), at least one, and finite."""
-    shape = np.shape(query)
-    if len(shape) != 2 or shape[1] != 3 or shape[0] < 1:
-        raise InputError(f"{function}: query points have shape {shape}; expected (queries, 3). Try tdf.box_query(key, count=500)")
-    if not isinstance(query, jax.core.Tracer) and not np.isfinite(np.asarray(query)).all():
-        raise InputError(f"{function}: some query points are NaN or infinite; expected finite metres")

@@ -66,7 +66,8 @@ def trajectory_energy(
         reference: the demonstration's.
         weights: of the terms.
     """
-    return descriptor_loss(trajectory, field, reference) + pose_energy(trajectory, field.origin, reference, weights)
+    R, t = trajectory.rotations, trajectory.translations
+    return descriptor_loss(trajectory, field, reference) + pose_energy(R, t, field.origin, reference, weights)
 
 
 def descriptor_loss(trajectory: Trajectory, field: DescriptorField, reference: Reference) -> Float[Array, ""]:
@@ -99,11 +100,19 @@ def waypoint_loss(
 
 
 def pose_energy(
-    trajectory: Trajectory, origin: Float[Array, "3"], reference: Reference, weights: EnergyWeights
+    R: Float[Array, "poses 3 3"], t: Float[Array, "poses 3"], origin: Float[Array, "3"], reference: Reference, weights: EnergyWeights
 ) -> Float[Array, ""]:
-    """What the energy adds to eq. 2: the weighted terms that depend on the poses alone."""
-    correlation = correlation_loss(trajectory, origin, reference, weights.lever, weights.pose_norm)
-    return weights.correlation * correlation + weights.compensator * compensator_loss(trajectory)
+    """What the energy adds to eq. 2: the weighted terms that depend on the poses alone.
+
+    Args:
+        R, t: poses of the query frame in the world; matrices, for the optimiser has them and quaternions would cost it a third
+            of its compile time.
+        origin: centroid of the new object's cloud, metres, world frame.
+        reference: the demonstration's.
+        weights: of the terms.
+    """
+    correlation = _correlation(R, t, origin, reference, weights.lever, weights.pose_norm)
+    return weights.correlation * correlation + weights.compensator * jnp.sum(_step_lengths(R, t))
 
 
 def correlation_loss(
@@ -123,13 +132,7 @@ def correlation_loss(
         reference: the demonstration's.
         lever, pose_norm: see `EnergyWeights`; by default the plain Frobenius norm of the 4x4 matrices.
     """
-    target = reference.trajectory
-    shift = trajectory.translations - origin - target.translations
-    if pose_norm == "metres_radians":
-        turn = poses.rotation_distance(trajectory.rotations, target.rotations)[:, None]
-    else:
-        turn = (trajectory.rotations - target.rotations).reshape(-1, 9)
-    return jnp.mean(_norm(jnp.concatenate([shift, lever * turn], axis=-1)))
+    return _correlation(trajectory.rotations, trajectory.translations, origin, reference, lever, pose_norm)
 
 
 def compensator_loss(trajectory: Trajectory, order: str = "frobenius") -> Float[Array, ""]:
@@ -138,11 +141,30 @@ def compensator_loss(trajectory: Trajectory, order: str = "frobenius") -> Float[
     Args:
         trajectory: poses of the query frame.
         order: "frobenius", summed over pairs as in eq. 6, or "infinity", the largest of them.
+
+    Raises:
+        InputError: an unknown order.
     """
-    steps = poses.compose(poses.inverse(trajectory.wxyz_xyz[:-1]), trajectory.wxyz_xyz[1:])
-    turn = (poses.rotation(steps) - jnp.eye(3, dtype=steps.dtype)).reshape(-1, 9)
-    lengths = _norm(jnp.concatenate([poses.translation(steps), turn], axis=-1))
+    if order not in ("frobenius", "infinity"):
+        raise InputError(f"compensator_loss(): order is {order!r}; expected 'frobenius' or 'infinity'")
+    lengths = _step_lengths(trajectory.rotations, trajectory.translations)
     return jnp.max(lengths) if order == "infinity" else jnp.sum(lengths)
+
+
+def _correlation(R, t, origin, reference, lever, pose_norm):
+    target = reference.trajectory
+    shift = t - origin - target.translations
+    if pose_norm == "metres_radians":
+        turn = poses.rotation_distance(R, target.rotations)[:, None]
+    else:
+        turn = (R - target.rotations).reshape(-1, 9)
+    return jnp.mean(_norm(jnp.concatenate([shift, lever * turn], axis=-1)))
+
+
+def _step_lengths(R, t):
+    """||T_i^-1 T_{i+1} - I||_F of neighbouring poses; a rotation more on both sides does not change it."""
+    turn = (R[1:] - R[:-1]).reshape(-1, 9)
+    return _norm(jnp.concatenate([t[1:] - t[:-1], turn], axis=-1))
 
 
 def _norm(x):

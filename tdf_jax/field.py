@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from tdf_jax.errors import InputError
 from tdf_jax.network import NORM_FLOOR, Conditioned, decode
 
 
@@ -34,7 +35,7 @@ class DescriptorField:
         Args:
             x: points, metres, world frame.
         """
-        activations, _ = decode(self.conditioned, jnp.asarray(x) - self.origin)
+        activations, _ = self._decode("descriptors", x)
         descriptor = jnp.concatenate(activations, axis=-1)
         # |p|^2 and fc_in are never all zero together in a trained network, so the square root is differentiable where it matters.
         return descriptor / jnp.maximum(jnp.sqrt(jnp.sum(descriptor**2, axis=-1, keepdims=True)), NORM_FLOOR)
@@ -45,4 +46,10 @@ class DescriptorField:
         Args:
             x: points, metres, world frame.
         """
-        return jax.nn.sigmoid(decode(self.conditioned, jnp.asarray(x) - self.origin)[1])
+        return jax.nn.sigmoid(self._decode("occupancy", x)[1])
+
+    def _decode(self, function, x):
+        x = jnp.asarray(x)
+        if x.shape[-1:] != (3,):
+            raise InputError(f"DescriptorField.{function}(): x has shape {x.shape}; expected (..., 3), metres")
+        return decode(self.conditioned, x - self.origin)

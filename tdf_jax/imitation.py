@@ -52,7 +52,7 @@ def imitate(
     field = encode(model, thinned(model, points))
     goal = default_goal(field, reference) if goal is None else _finite("goal", goal, (7,))
     if goal_offset is not None:
-        goal = goal.at[4:].add(_finite("goal_offset", goal_offset, (3,)))
+        goal = goal + jnp.pad(_finite("goal_offset", goal_offset, (3,)), (4, 0))
     return optimize(
         field, reference, key, goal=goal, fix_last=fix_last, energy=energy, config=config, progress=progress
     )

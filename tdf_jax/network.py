@@ -14,6 +14,8 @@ References:
 import dataclasses
 import functools
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import flax.linen as nn
 import jax
@@ -25,6 +27,7 @@ Vectors = tuple[Float[Array, "points channels"], Float[Array, "points channels"]
 
 VECTOR_EPSILON = 1e-6  # added to |d|^2 in the vector leaky ReLU, as in the original
 NORM_FLOOR = 1e-12  # least norm a descriptor is divided by, as in the original
+NEIGHBOUR_ROWS = 2048  # points whose distances to all others exist at a time
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,9 +173,15 @@ def _bilinear(a, b):
 
 def nearest_neighbours(points: Float[Array, "points 3"], count: int):
     """Indices (points, count) of the nearest points by Euclidean distance, the point itself included."""
-    # Differences, not |a|^2 + |b|^2 - 2ab: in float32 the latter misorders near neighbours of a cloud far from zero.
-    squared = sum((points[:, None, axis] - points[None, :, axis]) ** 2 for axis in range(3))
-    return jax.lax.top_k(-jax.lax.stop_gradient(squared), count)[1]
+    points = jax.lax.stop_gradient(points)
+
+    def nearest(x):
+        # Differences, not |a|^2 + |b|^2 - 2ab: in float32 the latter misorders near neighbours of a cloud far from zero.
+        squared = sum((points[:, axis] - x[axis]) ** 2 for axis in range(3))
+        return jax.lax.top_k(-squared, count)[1]
+
+    # In blocks, for all distances of a dense cloud do not fit: 6 GB at 40,000 points.
+    return jax.lax.map(nearest, points, batch_size=NEIGHBOUR_ROWS)
 
 
 class VectorResidualBlock(nn.Module):
@@ -367,10 +376,11 @@ def initialise(key, config: NetworkConfig = NetworkConfig()) -> dict:
     return OccupancyNetwork(config).init(key, jnp.zeros((config.neighbours + 1, 3)))["params"]
 
 
-def parameter_shapes(config: NetworkConfig) -> dict[str, tuple[int, ...]]:
+@functools.cache  # a tenth of a second, and every load asks for it
+def parameter_shapes(config: NetworkConfig) -> Mapping[str, tuple[int, ...]]:
     """Shape of every parameter, by dotted name."""
     shapes = jax.eval_shape(lambda: initialise(jax.random.key(0), config))
-    return {name: leaf.shape for name, leaf in flatten_dict(shapes, sep=".").items()}
+    return MappingProxyType({name: leaf.shape for name, leaf in flatten_dict(shapes, sep=".").items()})
 
 
 def parameter_count(config: NetworkConfig) -> int:

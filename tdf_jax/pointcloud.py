@@ -131,13 +131,15 @@ def check_points(points, name: str = "points"):
     return points
 
 
-def sample_surface(mesh: "trimesh.Trimesh", count: int, rng: np.random.Generator) -> Float[np.ndarray, "points 3"]:
+def sample_surface(
+    mesh: "trimesh.Trimesh", count: int, rng: np.random.Generator | int
+) -> Float[np.ndarray, "points 3"]:
     """Points drawn uniformly by area from the surface of a mesh.
 
     Args:
         mesh: The mesh.
         count: How many, at least 1.
-        rng: Random generator.
+        rng: Random generator, or a seed.
 
     Returns:
         Points, in the unit of the mesh, float64.
@@ -147,6 +149,7 @@ def sample_surface(mesh: "trimesh.Trimesh", count: int, rng: np.random.Generator
     """
     if count < 1:
         raise InputError(f"sample_surface(): count is {count}; expected at least 1.")
+    rng = np.random.default_rng(rng)
     corner, second, third = np.moveaxis(np.asarray(mesh.vertices)[np.asarray(mesh.faces)], 1, 0)
     u, v = second - corner, third - corner
     cumulative = np.cumsum(np.linalg.norm(np.cross(u, v), axis=1))

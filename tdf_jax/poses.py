@@ -4,7 +4,8 @@ Rotations are matrices `R` (..., 3, 3), rotation vectors (axis times angle, radi
 Poses are `wxyz_xyz` (..., 7), quaternion then translation in metres: the layout of `jaxlie.SE3`. Quaternions are
 normalised on use, so any non-zero multiple of one is the same rotation, and they come out with w >= 0.
 
-Every function is differentiable with finite gradients everywhere, the identity and half turns included.
+Every function is differentiable with finite gradients everywhere, the identity and half turns included, and compiled: op by op, the
+first trajectory of a process would cost 30 small compilations.
 """
 
 import jax
@@ -19,6 +20,7 @@ _SMALL_ANGLE_SQUARED = 0.03
 _SMALL_SINE_SQUARED = 1e-3
 
 
+@jax.jit
 def exp(rotation_vector: Float[Array, "... 3"]) -> Float[Array, "... 3 3"]:
     """Rotation matrix of a rotation vector.
 
@@ -40,6 +42,7 @@ def exp(rotation_vector: Float[Array, "... 3"]) -> Float[Array, "... 3 3"]:
     return matrix_from_wxyz(jnp.concatenate([w, xyz], axis=-1))
 
 
+@jax.jit
 def log(R: Float[Array, "... 3 3"]) -> Float[Array, "... 3"]:
     """Rotation vector of a rotation matrix, the shortest one.
 
@@ -59,6 +62,7 @@ def log(R: Float[Array, "... 3 3"]) -> Float[Array, "... 3"]:
     return jnp.where(small, series, 2 * jnp.arctan2(sine, w) / sine) * xyz
 
 
+@jax.jit
 def matrix_from_wxyz(wxyz: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
     """Rotation matrix of a quaternion.
 
@@ -78,6 +82,7 @@ def matrix_from_wxyz(wxyz: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
     return jnp.stack(entries, axis=-1).reshape(*wxyz.shape[:-1], 3, 3)
 
 
+@jax.jit
 def wxyz_from_matrix(R: Float[Array, "... 3 3"]) -> Float[Array, "... 4"]:
     """Unit quaternion of a rotation matrix, with w >= 0.
 
@@ -120,6 +125,7 @@ def uniform_rotations(key: PRNGKeyArray, count: int) -> Float[Array, "count 3 3"
     return matrix_from_wxyz(jax.random.normal(key, (count, 4)))
 
 
+@jax.jit
 def rotation_distance(R_a: Float[Array, "... 3 3"], R_b: Float[Array, "... 3 3"]) -> Float[Array, "..."]:
     """Angle of the rotation between two rotations.
 
@@ -137,6 +143,7 @@ def rotation_distance(R_a: Float[Array, "... 3 3"], R_b: Float[Array, "... 3 3"]
     return 2 * jnp.arctan2(sine, wxyz[..., 0])
 
 
+@jax.jit
 def geodesic(
     R_a: Float[Array, "... 3 3"], R_b: Float[Array, "... 3 3"], fraction: Float[Array, "..."] | float
 ) -> Float[Array, "... 3 3"]:
@@ -153,6 +160,7 @@ def geodesic(
     return _multiply(R_a, exp(jnp.asarray(fraction)[..., None] * log(_relative(R_a, R_b))))
 
 
+@jax.jit
 def pose(R: Float[Array, "... 3 3"], t: Float[Array, "... 3"]) -> Float[Array, "... 7"]:
     """Pose of a rotation matrix and a translation.
 
@@ -176,6 +184,7 @@ def translation(wxyz_xyz: Float[Array, "... 7"]) -> Float[Array, "... 3"]:
     return wxyz_xyz[..., 4:]
 
 
+@jax.jit
 def compose(a: Float[Array, "... 7"], b: Float[Array, "... 7"]) -> Float[Array, "... 7"]:
     """Pose that applies b, then a: T_x_z = compose(T_x_y, T_y_z).
 
@@ -197,6 +206,7 @@ def compose(a: Float[Array, "... 7"], b: Float[Array, "... 7"]) -> Float[Array, 
     return _join(_unit(jnp.stack(product, axis=-1)), transform(a, b[..., None, 4:])[..., 0, :])
 
 
+@jax.jit
 def inverse(a: Float[Array, "... 7"]) -> Float[Array, "... 7"]:
     """Inverse poses: compose(a, inverse(a)) is the identity.
 
@@ -210,6 +220,7 @@ def inverse(a: Float[Array, "... 7"]) -> Float[Array, "... 7"]:
     return _join(wxyz, -rotate(matrix_from_wxyz(wxyz), a[..., None, 4:])[..., 0, :])
 
 
+@jax.jit
 def transform(wxyz_xyz: Float[Array, "... 7"], x: Float[Array, "... queries 3"]) -> Float[Array, "... queries 3"]:
     """Points carried by poses: R x + t.
 
@@ -223,6 +234,7 @@ def transform(wxyz_xyz: Float[Array, "... 7"], x: Float[Array, "... queries 3"])
     return rotate(rotation(wxyz_xyz), x) + wxyz_xyz[..., None, 4:]
 
 
+@jax.jit
 def rotate(R: Float[Array, "... 3 3"], x: Float[Array, "... queries 3"]) -> Float[Array, "... queries 3"]:
     """Points turned by rotations: R x.
 

@@ -380,15 +380,15 @@ def _vector(function: str, name: str, value: ArrayLike) -> np.ndarray:
 
 
 def _rotation(function: str, rotation: ArrayLike) -> Float[Array, "3 3"]:
-    rotation = jnp.asarray(rotation, dtype=float)
+    rotation = np.asarray(rotation, dtype=np.float64)
     if rotation.shape == (4,):
-        if not jnp.isfinite(rotation).all() or not jnp.any(rotation != 0):
+        if not (np.isfinite(rotation).all() and rotation.any()):
             raise InputError(f"{function}(): rotation wxyz is {rotation}; expected a finite quaternion, not zero.")
-        return se3.matrix_from_wxyz(rotation)
+        return se3.matrix_from_wxyz(jnp.asarray(rotation))
     if rotation.shape != (3, 3):
         raise InputError(f"{function}(): rotation has shape {rotation.shape}; expected (3, 3), or (4,) as wxyz.")
     _check_rotations(function, rotation)
-    return rotation
+    return jnp.asarray(rotation)
 
 
 def _trajectory(function, poses, start, end, rotation, end_rotation, curve, height=None, bulge=None) -> Trajectory:

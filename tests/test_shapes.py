@@ -129,6 +129,15 @@ def test_the_handle_merges_with_the_wall_and_stays_out_of_the_cavity(style):
     assert not in_cavity.any()  # the inner wall starts at 0.0359 there
 
 
+def test_flare_thickens_the_handle_at_the_wall_only():
+    plain = MugParameters(handle_thickness=0.010, handle_flare=1.0)
+    flared = replace(plain, handle_flare=1.5)
+    above = np.array([[0.0415, 0, plain.handle_top + 0.0060 - plain.height / 2]])  # half thickness 0.005, flared 0.0075
+    assert build_mug(flared).contains(above).all() and not build_mug(plain).contains(above).any()
+    beyond = build_mug(plain).handle_frame[None, :3, 3] + np.array([[0.0055, 0, 0]])
+    assert not build_mug(flared).contains(beyond).any()
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_contains_agrees_with_the_winding_number_of_the_mesh(seed):
     mug, rng = sampled(100 + seed), np.random.default_rng(seed)

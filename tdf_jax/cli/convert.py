@@ -1,11 +1,19 @@
 """`tdf convert`: a PyTorch NDF checkpoint -> weights that `--weights` and `load_model` take."""
 
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
 from tdf_jax.checkpoint import save_model
 from tdf_jax.convert import convert_checkpoint
 from tdf_jax.network import parameter_count
 
 
-def convert(source: str, target: str) -> None:
+def convert(
+    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IN.pth")],
+    target: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT.safetensors")],
+) -> None:
     """Convert a published Neural Descriptor Fields checkpoint; nothing in it is executed.
 
     Args:

@@ -5,13 +5,14 @@ import os
 import sys
 from collections.abc import Sequence
 
+import jax
 import tyro
 
 from tdf_jax.errors import InputError
 
-COMMANDS = ("imitate", "convert", "train")  # each is a function in a module of its name
-# Flags once (`--json`, not also `--no-json`), and vectors as `X Y Z`.
-STYLE = (tyro.conf.FlagCreatePairsOff,)
+MEMORY = "error: out of memory; lower the number of starts, poses, query points or points"
+COMMANDS = ("imitate", "convert", "evaluate", "train")  # each is a function in the module of its name
+STYLE = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)  # `--json` without `--no-json`, no word for "not given"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -21,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         arguments: the words after `tdf`; by default the process's.
 
     Raises:
-        SystemExit: 2 for a user's mistake (a message is on stderr), 130 where the user interrupted.
+        SystemExit: 2 for a user's mistake, 130 for an interruption, each with a line on stderr; 0 after --help.
     """
     commands = {name: getattr(importlib.import_module(f"tdf_jax.cli.{name}"), name) for name in COMMANDS}
     try:
@@ -29,16 +30,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
             commands,
             prog="tdf",
             description="Imitate a demonstrated pick-and-place trajectory on new objects.",
-            args=None if arguments is None else list(arguments),
+            args=arguments,
             config=STYLE,
         )
-    except InputError as error:
+        sys.stdout.flush()
+    except (InputError, FloatingPointError) as error:
         _fail(f"error: {error}", 2)
     except MemoryError:
-        _fail("error: out of memory; lower --inits, --queries or --points", 2)
+        _fail(MEMORY, 2)
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        _fail(MEMORY, 2)
     except KeyboardInterrupt:
         _fail("interrupted", 130)
-    except BrokenPipeError:  # `tdf ... | head`: the reader has what it wanted
+    except BrokenPipeError:  # `tdf imitate --json | head`: nobody reads on, and Python would complain again at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

@@ -1,74 +1,114 @@
 """What `tdf imitate` works on: a demonstration and a target, from the user's files or a pair of generated mugs."""
 
 import dataclasses
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
+from tdf_jax.cli.settings import Settings
 from tdf_jax.demonstration import Demonstration
-from tdf_jax.evaluation.cases import Case, random_pose
-from tdf_jax.pointcloud import load_points
+from tdf_jax.errors import InputError
+from tdf_jax.evaluation.cases import Case, mug_case, random_pose
+from tdf_jax.evaluation.truth import expected_trajectory
+from tdf_jax.pointcloud import load_mesh, load_points
 from tdf_jax.query import box_query
-from tdf_jax.trajectory import line, semicircle, wave
+from tdf_jax.recording import load_demonstration
+from tdf_jax.trajectory import Trajectory, line, resample, semicircle, wave
+
+if TYPE_CHECKING:
+    import trimesh
 
 SHAPES = {"line": line, "semicircle": semicircle, "wave": wave}
+MUG_HEIGHT = 0.12  # metres
 QUERY_SIZE = 0.08  # metres, edge of the box of query points about the handle
 PLACE = (0.0, 0.24, 0.18)  # metres from the pick: 0.30 m away, to the handle's side and up
 LIFT = (0.0, 0.0, 1.0)  # a semicircle and a wave leave the straight line upwards first
 
 
 @dataclasses.dataclass(frozen=True)
-class Target:
-    """The object to imitate on.
+class Scene:
+    """A demonstration, and the object to imitate it on.
 
     Attributes:
-        points: cloud, (points, 3), metres, world frame.
-        T_world_object: how the generated mug's frame, or the file's, lies in the world, 4x4.
-        T_world_handle: frame of the handle, 4x4, where it is known.
+        demonstration: as given or generated.
+        points: the target's cloud, (points, 3), metres, world frame.
+        T_world_target: how the file's frame, or the generated mug's, lies in the world, 4x4.
+        T_world_handles: frames of the handle on both objects, 4x4; None unless both are generated.
+        meshes: of both objects, world frame, where they have one.
     """
 
+    demonstration: Demonstration
     points: Float[np.ndarray, "points 3"]
-    T_world_object: Float[np.ndarray, "4 4"]
-    T_world_handle: Float[np.ndarray, "4 4"] | None
+    T_world_target: Float[np.ndarray, "4 4"]
+    T_world_handles: tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"]] | None
+    meshes: "tuple[trimesh.Trimesh | None, trimesh.Trimesh | None]"
+
+    def expected(self, goal: Float[Array, "7"]) -> Trajectory | None:
+        """The true trajectory on the target for a goal; None where it is not known."""
+        if self.T_world_handles is None:
+            return None
+        return expected_trajectory(self.demonstration.trajectory, *self.T_world_handles, goal)
 
 
-def generated_demonstration(case: Case, shape: str, poses: int, queries: int, key: PRNGKeyArray) -> Demonstration:
-    """A trajectory from the handle of the pair's first mug to a place beside and above it.
+def make_scene(settings: Settings, key: PRNGKeyArray) -> Scene:
+    """Read or generate both objects.
 
     Args:
-        case: the pair.
-        shape: a name in `SHAPES`.
-        poses: how many.
-        queries: query points, in a box about the handle.
+        settings: resolved.
         key: of the query points.
+
+    Raises:
+        InputError: a file that cannot be used, or a number that makes no trajectory.
     """
-    pick = case.T_world_place_a
-    start, bow = pick[:3, 3], {} if shape == "line" else {"bulge": LIFT}
-    trajectory = SHAPES[shape](poses, start, start + np.array(PLACE), rotation=pick[:3, :3], **bow)
-    return Demonstration(case.points_a, trajectory, box_query(key, queries, QUERY_SIZE))
+    shown, found = _read_demonstration(settings), _read_target(settings)
+    pair, shown_mesh, handles = None, None, None
+    T_world_target = np.eye(4) if settings.target_pose == "given" else random_pose(settings.seed, 0)
+    if shown is None or found is None:  # after the files: a bad one is told at once
+        pair = mug_case(settings.seed, 0, height=MUG_HEIGHT, points=settings.points)
+    if found is None:
+        T_mug_world = np.linalg.inv(pair.T_world_b)
+        found = _moved(pair.points_b, T_mug_world), pair.object_b.mesh
+        if shown is None:
+            handles = (pair.T_world_place_a, T_world_target @ T_mug_world @ pair.T_world_place_b)
+    if shown is None:
+        shown, shown_mesh = _generated(settings, pair, key), pair.object_a.mesh
+    points, mesh = found
+    return Scene(
+        demonstration=shown,
+        points=_moved(points, T_world_target),
+        T_world_target=T_world_target,
+        T_world_handles=handles,
+        meshes=(shown_mesh, None if mesh is None else mesh.copy().apply_transform(T_world_target)),
+    )
 
 
-def generated_target(case: Case, pose: str) -> Target:
-    """The pair's second mug, in its random pose or, "given", with its own frame at the world's."""
-    if pose == "random":
-        return Target(case.points_b, case.T_world_b, case.T_world_place_b)
-    T_object_world = np.linalg.inv(case.T_world_b)
-    return Target(_moved(case.points_b, T_object_world), np.eye(4), T_object_world @ case.T_world_place_b)
+def _read_demonstration(settings: Settings) -> Demonstration | None:
+    if settings.demonstration is None:
+        return None
+    shown = load_demonstration(settings.demonstration)
+    if settings.poses in (None, shown.trajectory.poses):
+        return shown
+    return dataclasses.replace(shown, trajectory=resample(shown.trajectory, settings.poses))
 
 
-def file_target(path: str | Path, scale: float, points: int, pose: str, seed: int) -> Target:
-    """An object from a mesh or a cloud; no handle is known.
+def _read_target(settings: Settings):
+    """Points and, if it has faces, the mesh."""
+    if settings.target is None:
+        return None
+    points = load_points(settings.target, settings.points, settings.scale, settings.seed)
+    try:
+        return points, load_mesh(settings.target, settings.scale)
+    except InputError:  # not a mesh, then: it has just been read as a cloud
+        return points, None
 
-    Args:
-        path: the file; see `load_points`.
-        scale: metres per unit of the file.
-        points: drawn from a mesh's surface, or from a larger cloud.
-        pose: "given", as it lies in its file, or "random".
-        seed: of the draw and the pose.
-    """
-    T_world_object = np.eye(4) if pose == "given" else random_pose(seed, 0)
-    return Target(_moved(load_points(path, points, scale, seed), T_world_object), T_world_object, None)
+
+def _generated(settings: Settings, pair: Case, key: PRNGKeyArray) -> Demonstration:
+    pick = pair.T_world_place_a
+    start, bow = pick[:3, 3], {} if settings.trajectory == "line" else {"bulge": LIFT}
+    shape = SHAPES[settings.trajectory]
+    trajectory = shape(settings.poses, start, start + np.array(PLACE), rotation=pick[:3, :3], **bow)
+    return Demonstration(pair.points_a, trajectory, box_query(key, settings.queries, QUERY_SIZE))
 
 
 def _moved(points, T):

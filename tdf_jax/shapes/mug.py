@@ -14,14 +14,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tdf_jax.errors import InputError
+from tdf_jax.shapes.solid import Solid, Tube, in_solid, in_tube, mitres, resample, skin, solid_rings, tube_rings
 
 if TYPE_CHECKING:
     import trimesh
 
 HANDLE_STYLES = ("d", "ring", "ear", "square")
 
-_AROUND = 64  # polygon corners around the body; a multiple of 8, so a square mug keeps its corners
-_TUBE_AROUND = 16  # polygon corners around the handle's tube
 _TUBE_RINGS = 30  # rings along the handle
 _MAY_BE_ZERO = ("bulge", "edge_radius", "foot_height", "lip_radius")
 _DIMENSIONLESS = ("squareness", "handle_style", "handle_squareness", "handle_flare")
@@ -75,31 +74,10 @@ class MugParameters:
     handle_flare: float = 1.15
 
 
-class _Solid(NamedTuple):
-    """A polygon of unit size (see `_polygon`) scaled by `radii` at `heights`, flat in between."""
-
-    heights: np.ndarray
-    radii: np.ndarray
-    squareness: float
-
-
-class _Tube(NamedTuple):
-    """A section swept along `line` (rings, 2) in the x-z plane, cut at each ring along its mitre (rings, 2).
-
-    The section is the unit polygon times `section` = half (thickness, width), and times `scales` (rings,).
-    """
-
-    line: np.ndarray
-    mitres: np.ndarray
-    scales: np.ndarray
-    section: np.ndarray
-    squareness: float
-
-
 class _Geometry(NamedTuple):
-    outer: _Solid
-    hollows: tuple[_Solid, ...]
-    tube: _Tube
+    outer: Solid
+    hollows: tuple[Solid, ...]
+    tube: Tube
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,9 +127,9 @@ class Mug:
         if not np.isfinite(points).all():
             raise InputError("Mug.contains(): points hold NaN or infinite numbers; expected finite metres; remove them")
         outer, hollows, tube = self._geometry
-        clay = _in_solid(outer, points) | _in_tube(tube, points)
+        clay = in_solid(outer, points) | in_tube(tube, points)
         for hollow in hollows:
-            clay &= ~_in_solid(hollow, points)
+            clay &= ~in_solid(hollow, points)
         return clay
 
 
@@ -172,9 +150,9 @@ def build_mug(parameters: MugParameters = MugParameters()) -> Mug:
     _check(parameters)
     outer, hollows, tube = _geometry(parameters)
     fast = {"engine": "manifold", "check_volume": False}  # the parts are closed by construction; the result is checked
-    clay = trimesh.boolean.union([_skin(_solid_rings(outer)), _skin(_tube_rings(tube))], **fast)
+    clay = trimesh.boolean.union([skin(solid_rings(outer)), skin(tube_rings(tube))], **fast)
     # The cavity is cut after the handle is joined: nothing of the handle is left inside it.
-    mesh = trimesh.boolean.difference([clay, *(_skin(_solid_rings(hollow)) for hollow in hollows)], **fast)
+    mesh = trimesh.boolean.difference([clay, *(skin(solid_rings(hollow)) for hollow in hollows)], **fast)
     if not (mesh.is_volume and mesh.euler_number == 0 and mesh.body_count == 1):
         raise InputError(f"build_mug(): the dimensions give no single closed cup with one handle; got {parameters}; "
                          "expected walls and handle of a common mug: move them towards the defaults")
@@ -299,9 +277,9 @@ def _check(parameters: MugParameters) -> None:
 
 def _check_handle(p: MugParameters, need) -> None:
     outer, _, tube = _geometry(p)
-    rings = _tube_rings(tube)
+    rings = tube_rings(tube)
     need(rings[..., 2].min() > -p.height / 2, "the handle hangs below the bottom: raise handle_bottom")
-    buried = _in_solid(outer, np.concatenate([rings[0], rings[-1]])).all()
+    buried = in_solid(outer, np.concatenate([rings[0], rings[-1]])).all()
     need(buried, "the handle does not end inside the body: move its attachments away from the rounded edge")
     steps = np.diff(rings[..., [0, 2]], axis=0)
     forward = np.einsum("smi,si->sm", steps, np.diff(tube.line, axis=0))
@@ -339,28 +317,28 @@ def _geometry(p: MugParameters) -> _Geometry:
     floor = p.foot_height + p.bottom_thickness
     levels = _levels(p, 0.0, p.height, p.edge_radius, p.lip_radius)
     radii = _wall(p, levels) - _inset(levels, p.edge_radius) - _inset(p.height - levels, p.lip_radius)
-    outer = _Solid(levels - p.height / 2, radii, p.squareness)
+    outer = Solid(levels - p.height / 2, radii, p.squareness)
     levels = _levels(p, floor, p.height, _inner_edge(p), p.lip_radius)
     radii = _wall(p, levels) - p.wall_thickness
     radii = radii - _inset(levels - floor, _inner_edge(p)) + _inset(p.height - levels, p.lip_radius)
     above = np.append(levels, 1.5 * p.height)  # cut well past the rim, so no two faces coincide
-    cavity = _Solid(above - p.height / 2, np.append(radii, radii[-1]), p.squareness)
+    cavity = Solid(above - p.height / 2, np.append(radii, radii[-1]), p.squareness)
     if p.foot_height == 0:
         return _Geometry(outer, (cavity,), _tube(p))
     inner = p.bottom_radius - p.edge_radius - p.foot_width
-    recess = _Solid(np.array([-p.height, p.foot_height - p.height / 2]), np.array([inner, inner]), p.squareness)
+    recess = Solid(np.array([-p.height, p.foot_height - p.height / 2]), np.array([inner, inner]), p.squareness)
     return _Geometry(outer, (cavity, recess), _tube(p))
 
 
-def _tube(p: MugParameters) -> _Tube:
-    line = _resample(_centre_line(p), _TUBE_RINGS)
+def _tube(p: MugParameters) -> Tube:
+    line = resample(_centre_line(p), _TUBE_RINGS)
     share = np.linspace(-1, 1, len(line))
     scales = 1 + (p.handle_flare - 1) * share**4
     ends = np.stack([[0.4 * end[0], end[1]] for end in (line[0], line[-1])])  # buried: level, well inside the body
     line = np.concatenate([ends[:1], line, ends[1:]])
     scales = np.concatenate([scales[:1], scales, scales[-1:]])
     section = np.array([p.handle_thickness, p.handle_width]) / 2
-    return _Tube(line, _mitres(line), scales, section, p.handle_squareness)
+    return Tube(line, mitres(line), scales, section, p.handle_squareness)
 
 
 def _centre_line(p: MugParameters) -> np.ndarray:
@@ -388,7 +366,7 @@ def _centre_line(p: MugParameters) -> np.ndarray:
     return np.stack([wall + out * (x_bar - wall), middle + half * up], axis=1)
 
 
-def _grip(tube: _Tube, p: MugParameters) -> np.ndarray:
+def _grip(tube: Tube, p: MugParameters) -> np.ndarray:
     """The outermost point of the centre line half way between the attachments, (x, z)."""
     height = (p.handle_top + p.handle_bottom - p.height) / 2
     a, b = tube.line[:-1], tube.line[1:]
@@ -403,101 +381,3 @@ def _frame(x: float, z: float, outward: float) -> np.ndarray:
     frame = np.diag([outward, outward, 1.0, 1.0])
     frame[:3, 3] = x, 0.0, z
     return frame
-
-
-# The solids below know nothing of mugs: stacks of polygons, turned or swept, and their inside tests.
-
-
-def _polygon(exponent: float, count: int) -> np.ndarray:
-    """Corners (count, 2) on the unit superellipse at even angles, counter-clockwise from +x."""
-    angle = np.arange(count) * (2 * np.pi / count)
-    corners = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return corners / np.sum(np.abs(corners) ** exponent, axis=1, keepdims=True) ** (1 / exponent)
-
-
-def _gauge(flat: np.ndarray, exponent: float, count: int) -> np.ndarray:
-    """How much the polygon must grow to reach each point of `flat` (points, 2): 1 on its edges, as in the mesh."""
-    corners = _polygon(exponent, count)
-    edges = np.linalg.solve(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1), np.ones((count, 2, 1)))[..., 0]
-    sector = np.floor(np.arctan2(flat[:, 1], flat[:, 0]) * (count / (2 * np.pi))).astype(int) % count
-    return np.sum(edges[sector] * flat, axis=1)
-
-
-def _in_solid(solid: _Solid, points: np.ndarray) -> np.ndarray:
-    radius = np.interp(points[:, 2], solid.heights, solid.radii, left=-1.0, right=-1.0)
-    return _gauge(points[:, :2], solid.squareness, _AROUND) <= radius
-
-
-def _solid_rings(solid: _Solid) -> np.ndarray:
-    rings = solid.radii[:, None, None] * _polygon(solid.squareness, _AROUND)
-    heights = np.broadcast_to(solid.heights[:, None, None], (*rings.shape[:2], 1))
-    return np.concatenate([rings, heights], axis=-1)
-
-
-def _in_tube(tube: _Tube, points: np.ndarray) -> np.ndarray:
-    """Between the mitre planes of a step, and inside the section it has there."""
-    rings = _tube_rings(tube).reshape(-1, 3)
-    near = np.flatnonzero(np.all((points >= rings.min(axis=0)) & (points <= rings.max(axis=0)), axis=1))
-    flat, y = points[near][:, [0, 2]], points[near, 1]
-    forward = -_normal(tube.mitres)
-    past = flat @ forward.T - np.sum(tube.line * forward, axis=1)  # (near, rings), distance past each mitre plane
-    point, step = np.nonzero((past[:, :-1] >= 0) & (past[:, 1:] <= 0))
-    start, end = past[point, step], -past[point, step + 1]
-    share = start / np.maximum(start + end, np.finfo(float).tiny)
-    scale = tube.scales[step] + share * (tube.scales[step + 1] - tube.scales[step])
-    across = np.sum((flat[point] - tube.line[step]) * _normal(_directions(tube.line))[step], axis=1)
-    size = _gauge(np.stack([across, y[point]], axis=1) / tube.section, tube.squareness, _TUBE_AROUND)
-    inside = np.zeros(len(points), bool)
-    inside[near[point[size <= scale]]] = True
-    return inside
-
-
-def _tube_rings(tube: _Tube) -> np.ndarray:
-    section = _polygon(tube.squareness, _TUBE_AROUND) * tube.section
-    flat = tube.line[:, None] + tube.scales[:, None, None] * section[:, :1] * tube.mitres[:, None]
-    return np.stack([flat[..., 0], tube.scales[:, None] * section[:, 1], flat[..., 1]], axis=-1)
-
-
-def _mitres(line: np.ndarray) -> np.ndarray:
-    """The normal halving each bend, lengthened so that steps on both sides keep their thickness."""
-    normals = _normal(_directions(line))
-    before, after = np.concatenate([normals[:1], normals]), np.concatenate([normals, normals[-1:]])
-    return (before + after) / (1 + np.sum(before * after, axis=1, keepdims=True))
-
-
-def _directions(line: np.ndarray) -> np.ndarray:
-    steps = np.diff(line, axis=0)
-    return steps / np.linalg.norm(steps, axis=1, keepdims=True)
-
-
-def _normal(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (..., 2) of the x-z plane turned by 90 degrees, so that (turned, y, vector) is right-handed."""
-    return np.stack([vectors[..., 1], -vectors[..., 0]], axis=-1)
-
-
-def _resample(line: np.ndarray, count: int) -> np.ndarray:
-    """Place `count` points along a polyline, half by length and half by turning, so bends get short steps."""
-    knots = np.arange(len(line))
-    between = np.linspace(0, len(line) - 1, 8 * (len(line) - 1) + 1)
-    fine = np.stack([np.interp(between, knots, line[:, axis]) for axis in range(2)], axis=1)
-    steps = np.diff(fine, axis=0)
-    lengths = np.linalg.norm(steps, axis=1)
-    headings = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
-    turns = np.abs(np.gradient(headings))
-    cost = np.concatenate([[0.0], np.cumsum(lengths / lengths.sum() + turns / turns.sum())])
-    at = np.linspace(0, cost[-1], count)
-    return np.stack([np.interp(at, cost, fine[:, axis]) for axis in range(2)], axis=1)
-
-
-def _skin(rings: np.ndarray) -> "trimesh.Trimesh":
-    """Close rings (rings, corners, 3), counter-clockwise about the way they go, with fans at both ends."""
-    import trimesh
-
-    count, corners = rings.shape[:2]
-    here = np.arange(count * corners).reshape(count, corners)
-    there = np.roll(here, -1, axis=1)
-    first, last = np.full(corners, count * corners), np.full(corners, count * corners + 1)
-    triangles = [(here[:-1], there[:-1], there[1:]), (here[:-1], there[1:], here[1:]),
-                 (there[0], here[0], first), (here[-1], there[-1], last)]
-    faces = np.concatenate([np.stack(corner, axis=-1).reshape(-1, 3) for corner in triangles])
-    return trimesh.Trimesh(np.concatenate([rings.reshape(-1, 3), rings[[0, -1]].mean(axis=1)]), faces, process=False)

@@ -1,0 +1,113 @@
+"""What `tdf imitate` tells: the record of a run for machines, the table for people."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import numpy as np
+
+import tdf_jax
+from tdf_jax.cli.scene import Scene
+from tdf_jax.cli.settings import Settings
+from tdf_jax.energy import EnergyWeights
+from tdf_jax.evaluation.truth import path_error, pose_error
+from tdf_jax.model import Model
+from tdf_jax.optimize import OptimizeConfig, Result
+from tdf_jax.trajectory import Trajectory
+
+SCHEMA = 1  # raised when a field of result.json changes its meaning or goes
+RESULT = "result.json"
+NAMES = (RESULT, "trajectory.npz", "trajectory.tum", "imitation.png", "loss.png")
+
+
+def errors(trajectory: Trajectory, expected: Trajectory | None) -> dict | None:
+    """Distances from the truth, metres and radians; None where it is not known."""
+    if expected is None:
+        return None
+    distance, angle = pose_error(trajectory.wxyz_xyz[0], expected.wxyz_xyz[0])
+    return {
+        "pick_metres": float(distance),
+        "pick_radians": float(angle),
+        "path_metres": path_error(trajectory, expected),
+    }
+
+
+def title(loss: float, found: dict | None) -> str:
+    """One line over the picture."""
+    if found is None:
+        return f"loss {loss:.4f}; pick and path errors n/a"
+    angle = np.degrees(found["pick_radians"])
+    pick = f"pick-pose error {100 * found['pick_metres']:.1f} cm, {angle:.0f}°"
+    return f"loss {loss:.4f}; {pick}; path error {100 * found['path_metres']:.1f} cm"
+
+
+def record(
+    settings: Settings,
+    model: Model,
+    scene: Scene,
+    energy: EnergyWeights,
+    config: OptimizeConfig,
+    result: Result,
+    timings: dict[str, float],
+) -> dict:
+    """Everything about a run that result.json holds; numbers that are not finite are null."""
+    trajectory = result.trajectory
+    expected = scene.expected(trajectory.wxyz_xyz[-1])
+    demonstration = scene.demonstration
+    return {
+        "schema": SCHEMA,
+        "tdf_jax": tdf_jax.__version__,
+        "seed": settings.seed,
+        "settings": {name: _plain(value) for name, value in dataclasses.asdict(settings).items()},
+        "energy": dataclasses.asdict(energy),
+        "optimiser": dataclasses.asdict(config),
+        "weights": dataclasses.asdict(model.info),
+        "machine": {"jax": jax.__version__, "device": jax.devices()[0].device_kind, "backend": jax.default_backend()},
+        "demonstration": {
+            "points": len(demonstration.points),
+            "poses": demonstration.trajectory.poses,
+            "queries": len(demonstration.query),
+        },
+        "target": {"points": len(scene.points), "T_world_target": scene.T_world_target.tolist()},
+        "status": result.status,
+        "best": result.best,
+        "loss": {"start": float(result.losses[result.best, 0]), "end": result.loss},
+        "errors": errors(trajectory, expected),
+        "goal": _plain(trajectory.wxyz_xyz[-1]),
+        "expected": None if expected is None else _plain(expected.wxyz_xyz),
+        "energies": _plain(result.energies),
+        "losses": _plain(result.losses),
+        "seconds": {name: round(value, 3) for name, value in timings.items()},
+    }
+
+
+def table(record: dict, out: Path) -> str:
+    """The record in a few lines."""
+    found, seconds = record["errors"], record["seconds"]
+    sizes = record["demonstration"] | record["optimiser"]
+    parts = ", ".join(f"{name} {value:.1f}" for name, value in seconds.items() if name != "total")
+    pick = path = "n/a (the truth is not known)"
+    if found is not None:
+        pick = f"{100 * found['pick_metres']:.2f} cm, {np.degrees(found['pick_radians']):.1f} degrees"
+        path = f"{100 * found['path_metres']:.2f} cm, mean over waypoints"
+    rows = {
+        "run": "{inits} starts, {poses} poses, {queries} queries, {iterations} iterations".format(**sizes),
+        "loss, start": f"{record['loss']['start']:.5f}",
+        "loss, end": f"{record['loss']['end']:.5f}, start {record['best'] + 1} of {sizes['inits']} ({record['status']})",
+        "pick-pose error": pick,
+        "path error": path,
+        "time": f"{seconds['total']:.1f} s ({parts})",
+        "written to": str(out),
+    }
+    return "\n".join(f"{name:<17}{value}" for name, value in rows.items())
+
+
+def _plain(value):
+    """A value as JSON has it."""
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, jax.Array | np.ndarray):
+        return _plain(np.asarray(value).tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -1,0 +1,130 @@
+"""Solids made of stacked polygons, turned about an axis or swept along a line: their meshes and exact inside tests."""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import trimesh
+
+_AROUND = 64  # polygon corners around the body; a multiple of 8, so a square mug keeps its corners
+_TUBE_AROUND = 16  # polygon corners around the handle's tube
+
+
+class Solid(NamedTuple):
+    """A polygon of unit size (see `_polygon`) scaled by `radii` at `heights`, flat in between."""
+
+    heights: np.ndarray
+    radii: np.ndarray
+    squareness: float
+
+
+class Tube(NamedTuple):
+    """A section swept along `line` (rings, 2) in the x-z plane, cut at each ring along its mitre (rings, 2).
+
+    The section is the unit polygon times `section` = half (thickness, width), and times `scales` (rings,).
+    """
+
+    line: np.ndarray
+    mitres: np.ndarray
+    scales: np.ndarray
+    section: np.ndarray
+    squareness: float
+
+
+def _polygon(exponent: float, count: int) -> np.ndarray:
+    """Corners (count, 2) on the unit superellipse at even angles, counter-clockwise from +x."""
+    angle = np.arange(count) * (2 * np.pi / count)
+    corners = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return corners / np.sum(np.abs(corners) ** exponent, axis=1, keepdims=True) ** (1 / exponent)
+
+
+def _gauge(flat: np.ndarray, exponent: float, count: int) -> np.ndarray:
+    """How much the polygon must grow to reach each point of `flat` (points, 2): 1 on its edges, as in the mesh."""
+    corners = _polygon(exponent, count)
+    edges = np.linalg.solve(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1), np.ones((count, 2, 1)))[..., 0]
+    sector = np.floor(np.arctan2(flat[:, 1], flat[:, 0]) * (count / (2 * np.pi))).astype(int) % count
+    return np.sum(edges[sector] * flat, axis=1)
+
+
+def in_solid(solid: Solid, points: np.ndarray) -> np.ndarray:
+    """Which points (points, 3) lie in a turned solid."""
+    radius = np.interp(points[:, 2], solid.heights, solid.radii, left=-1.0, right=-1.0)
+    return _gauge(points[:, :2], solid.squareness, _AROUND) <= radius
+
+
+def solid_rings(solid: Solid) -> np.ndarray:
+    """The corners (rings, corners, 3) of a turned solid, upwards."""
+    rings = solid.radii[:, None, None] * _polygon(solid.squareness, _AROUND)
+    heights = np.broadcast_to(solid.heights[:, None, None], (*rings.shape[:2], 1))
+    return np.concatenate([rings, heights], axis=-1)
+
+
+def in_tube(tube: Tube, points: np.ndarray) -> np.ndarray:
+    """Between the mitre planes of a step, and inside the section it has there."""
+    rings = tube_rings(tube).reshape(-1, 3)
+    near = np.flatnonzero(np.all((points >= rings.min(axis=0)) & (points <= rings.max(axis=0)), axis=1))
+    flat, y = points[near][:, [0, 2]], points[near, 1]
+    forward = -_normal(tube.mitres)
+    past = flat @ forward.T - np.sum(tube.line * forward, axis=1)  # (near, rings), distance past each mitre plane
+    point, step = np.nonzero((past[:, :-1] >= 0) & (past[:, 1:] <= 0))
+    start, end = past[point, step], -past[point, step + 1]
+    share = start / np.maximum(start + end, np.finfo(float).tiny)
+    scale = tube.scales[step] + share * (tube.scales[step + 1] - tube.scales[step])
+    across = np.sum((flat[point] - tube.line[step]) * _normal(_directions(tube.line))[step], axis=1)
+    size = _gauge(np.stack([across, y[point]], axis=1) / tube.section, tube.squareness, _TUBE_AROUND)
+    inside = np.zeros(len(points), bool)
+    inside[near[point[size <= scale]]] = True
+    return inside
+
+
+def tube_rings(tube: Tube) -> np.ndarray:
+    """The corners (rings, corners, 3) of a swept tube, along its line."""
+    section = _polygon(tube.squareness, _TUBE_AROUND) * tube.section
+    flat = tube.line[:, None] + tube.scales[:, None, None] * section[:, :1] * tube.mitres[:, None]
+    return np.stack([flat[..., 0], tube.scales[:, None] * section[:, 1], flat[..., 1]], axis=-1)
+
+
+def mitres(line: np.ndarray) -> np.ndarray:
+    """The normal halving each bend, lengthened so that steps on both sides keep their thickness."""
+    normals = _normal(_directions(line))
+    before, after = np.concatenate([normals[:1], normals]), np.concatenate([normals, normals[-1:]])
+    return (before + after) / (1 + np.sum(before * after, axis=1, keepdims=True))
+
+
+def _directions(line: np.ndarray) -> np.ndarray:
+    steps = np.diff(line, axis=0)
+    return steps / np.linalg.norm(steps, axis=1, keepdims=True)
+
+
+def _normal(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (..., 2) of the x-z plane turned by 90 degrees, so that (turned, y, vector) is right-handed."""
+    return np.stack([vectors[..., 1], -vectors[..., 0]], axis=-1)
+
+
+def resample(line: np.ndarray, count: int) -> np.ndarray:
+    """Place `count` points along a polyline, half by length and half by turning, so bends get short steps."""
+    knots = np.arange(len(line))
+    between = np.linspace(0, len(line) - 1, 8 * (len(line) - 1) + 1)
+    fine = np.stack([np.interp(between, knots, line[:, axis]) for axis in range(2)], axis=1)
+    steps = np.diff(fine, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    headings = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+    turns = np.abs(np.gradient(headings))
+    cost = np.concatenate([[0.0], np.cumsum(lengths / lengths.sum() + turns / turns.sum())])
+    at = np.linspace(0, cost[-1], count)
+    return np.stack([np.interp(at, cost, fine[:, axis]) for axis in range(2)], axis=1)
+
+
+def skin(rings: np.ndarray) -> "trimesh.Trimesh":
+    """Close rings (rings, corners, 3), counter-clockwise about the way they go, with fans at both ends."""
+    import trimesh
+
+    count, corners = rings.shape[:2]
+    here = np.arange(count * corners).reshape(count, corners)
+    there = np.roll(here, -1, axis=1)
+    first, last = np.full(corners, count * corners), np.full(corners, count * corners + 1)
+    triangles = [(here[:-1], there[:-1], there[1:]), (here[:-1], there[1:], here[1:]),
+                 (there[0], here[0], first), (here[-1], there[-1], last)]
+    faces = np.concatenate([np.stack(corner, axis=-1).reshape(-1, 3) for corner in triangles])
+    return trimesh.Trimesh(np.concatenate([rings.reshape(-1, 3), rings[[0, -1]].mean(axis=1)]), faces, process=False)

@@ -1,0 +1,1 @@
+"""Pictures; matplotlib is loaded only by importing from here."""
