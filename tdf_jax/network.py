@@ -143,7 +143,9 @@ class EdgeConvolution(nn.Module):
         self.map_to_dir = VectorMap(3, self.channels)
 
     def __call__(self, points: Float[Array, "points 3"]) -> Vectors:
-        feature, direction = self.map_to_feat.kernel, self.map_to_dir.kernel
+        kernels = self.map_to_feat.kernel, self.map_to_dir.kernel
+        # Promoted first: products of float32 kernels would round away what float64 points ask for.
+        feature, direction = (kernel.astype(jnp.promote_types(kernel.dtype, points.dtype)) for kernel in kernels)
         own = tuple(points.T)  # planes (points,)
         spread = _map(lambda plane: plane[:, None], own)
         neighbours = points[nearest_neighbours(points, self.neighbours)]

@@ -148,7 +148,7 @@ def optimize(
         fix_last: keep the last pose at the goal; otherwise it starts there and is free.
         energy: weights of the terms.
         config: settings.
-        starts: use these instead of random ones; their last poses are replaced by the goal.
+        starts: use these instead of random ones; their last poses are replaced by the goal only where one is given.
         progress: called between blocks of iterations with the iterations done and the energies; may raise to cancel.
 
     Returns:
@@ -163,13 +163,11 @@ def optimize(
             f"optimize(): the reference has {reference.descriptors.shape[-1]} channels and the field {channels}; "
             "expected both from the same model"
         )
-    goal = default_goal(field, reference) if goal is None else jnp.asarray(goal)
-    if goal.shape != (7,) or not jnp.isfinite(goal).all() or not goal[:4].any():
-        raise InputError(
-            f"optimize(): goal of shape {goal.shape} is {goal}; expected one finite pose wxyz_xyz, (7,), its quaternion not zero"
-        )
     if starts is None:
+        goal = default_goal(field, reference) if goal is None else goal
         starts = random_starts(key, field, reference, config.inits, config.start, config.start_radius)
+    if goal is not None:
+        _check_goal(goal)
     starts = jnp.asarray(starts)
     if starts.ndim != 3 or starts.shape[1:] != (reference.trajectory.poses, 7):
         raise InputError(
@@ -179,7 +177,7 @@ def optimize(
     # One type of every traced number: mixed ones promote, and a weight of 0 for 0.02 would compile again.
     dtype = jnp.result_type(starts, reference.query, reference.descriptors, field.latent)
     energy = jax.tree.map(lambda weight: jnp.asarray(weight, dtype), energy)
-    starts, state = _begin(starts.astype(dtype), goal.astype(dtype), reference.query)
+    starts, state = _begin(starts.astype(dtype), None if goal is None else jnp.asarray(goal, dtype), reference.query)
     check_trajectory(Trajectory(np.reshape(starts, (-1, 7))), "starts")
     count = config.chunk or max(1, CHUNK_POINTS // len(reference.query))
     program = functools.partial(_run, fix_last=fix_last, chunk=count)
@@ -200,6 +198,14 @@ def optimize(
 def default_goal(field: DescriptorField, reference: Reference) -> Float[Array, "7"]:
     """The demonstration's last pose, carried by the centroids."""
     return reference.trajectory.shifted(field.origin).wxyz_xyz[-1]
+
+
+def _check_goal(goal):
+    values = np.asarray(goal)
+    if values.shape != (7,) or not np.isfinite(values).all() or not values[:4].any():
+        raise InputError(
+            f"optimize(): goal of shape {values.shape} is {values}; expected one finite pose wxyz_xyz, (7,), its quaternion not zero"
+        )
 
 
 def random_starts(
@@ -228,11 +234,11 @@ def _start(key, origin, reference, start, radius):
 
 @jax.jit
 def _begin(starts, goal, query):
-    """Starts that end at the goal, and the optimiser's state.
+    """Starts that end at the goal, if there is one, and the optimiser's state.
 
     The state is: the variables (rotation vectors away from the starts, places of the query centroid), Adam's moments, steps done.
     """
-    starts = starts.at[:, -1].set(goal)
+    starts = starts if goal is None else starts.at[:, -1].set(goal)
     places = poses.transform(starts, jnp.mean(query, axis=0)[None])[..., 0, :]
     variables = (jnp.zeros_like(places), places)
     return starts, (variables, optax.scale_by_adam().init(variables), jnp.zeros((), jnp.int32))
@@ -273,7 +279,7 @@ def _trajectories(state, starts, query, *, fix_last):
 def _evaluator(starts, field, reference, energy, fix_last, chunk):
     """Function from variables to every start's energy and its gradient with respect to the variables.
 
-    Equal to `jax.vmap(jax.value_and_grad(trajectory_energy))`, but a chunk of poses at a time. A fixed last pose is evaluated once,
+    Equal to `jax.vmap(jax.value_and_grad(trajectory_energy))`, but a chunk of poses at a time. A fixed last pose is evaluated once a call,
     not in every step, and has gradient zero.
     """
     inits, n = starts.shape[:2]
@@ -291,7 +297,8 @@ def _evaluator(starts, field, reference, energy, fix_last, chunk):
     start_rotations = poses.rotation(starts)
     fixed = 0.0
     if fix_last:
-        fixed = waypoint_loss(start_rotations[0, -1], starts[0, -1, 4:], field, query, reference.descriptors[-1])
+        last = start_rotations[:, -1], starts[:, -1, 4:]  # given starts may end apart
+        fixed = jax.lax.map(lambda pose: waypoint_loss(*pose, field, query, reference.descriptors[-1]), last)
 
     def flat(x):
         return x[:, :free].reshape(inits * free, *x.shape[2:])

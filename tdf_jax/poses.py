@@ -4,8 +4,8 @@ Rotations are matrices `R` (..., 3, 3), rotation vectors (axis times angle, radi
 Poses are `wxyz_xyz` (..., 7), quaternion then translation in metres: the layout of `jaxlie.SE3`. Quaternions are
 normalised on use, so any non-zero multiple of one is the same rotation, and they come out with w >= 0.
 
-Every function is differentiable with finite gradients everywhere, the identity and half turns included, and compiled: op by op, the
-first trajectory of a process would cost 30 small compilations.
+Every function is differentiable with finite gradients everywhere, the identity and half turns included, and compiled:
+op by op, the first trajectory of a process would cost 30 small compilations.
 """
 
 import jax

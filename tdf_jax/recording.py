@@ -19,8 +19,8 @@ def save_demonstration(path: str | os.PathLike, demonstration: Demonstration) ->
     """Write a demonstration.
 
     Args:
-        path: an .npz file in an existing folder. It gets the arrays `points` (points, 3), the object's cloud; `wxyz_xyz`
-            (poses, 7), T_world_query from the pick to the place; and `query` (queries, 3), in the query frame.
+        path: an .npz file in an existing folder. It gets the arrays `points` (points, 3), the object's cloud;
+            `wxyz_xyz` (poses, 7), T_world_query from the pick to the place; `query` (queries, 3), in the query frame.
         demonstration: what to write.
 
     Raises:

@@ -264,7 +264,8 @@ def test_check_points_says_what_is_wrong(message):
 
 def test_check_points_inside_jit_checks_the_shape():
     np.testing.assert_array_equal(jax.jit(check_points)(CLOUD), CLOUD)
-    assert np.isnan(jax.jit(check_points)(replaced(np.nan))).sum() == 2
+    with jax.debug_nans(False):
+        assert np.isnan(jax.jit(check_points)(replaced(np.nan))).sum() == 2
     with pytest.raises(InputError, match="has 20 points"):
         jax.jit(check_points)(CLOUD[:20])
 

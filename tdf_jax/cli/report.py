@@ -90,10 +90,11 @@ def table(record: dict, out: Path) -> str:
     if found is not None:
         pick = f"{100 * found['pick_metres']:.2f} cm, {np.degrees(found['pick_radians']):.1f} degrees"
         path = f"{100 * found['path_metres']:.2f} cm, mean over waypoints"
+    best = f"start {record['best'] + 1} of {sizes['inits']}; {record['status']}"
     rows = {
         "run": "{inits} starts, {poses} poses, {queries} queries, {iterations} iterations".format(**sizes),
         "loss, start": f"{record['loss']['start']:.5f}",
-        "loss, end": f"{record['loss']['end']:.5f}, start {record['best'] + 1} of {sizes['inits']} ({record['status']})",
+        "loss, end": f"{record['loss']['end']:.5f} ({best})",
         "pick-pose error": pick,
         "path error": path,
         "time": f"{seconds['total']:.1f} s ({parts})",

@@ -80,7 +80,7 @@ def resolved(settings: Settings) -> Settings:
         )
     for name in ("trajectory", "queries"):
         if getattr(settings, name) is not None:
-            raise InputError(f"tdf imitate: --{name} is for generated demonstrations; --demonstration has its own. Drop one")
+            raise InputError(f"tdf imitate: --{name} is for a generated demonstration, and there is a file; drop one")
     return dataclasses.replace(settings, target_pose=pose)
 
 

@@ -11,6 +11,8 @@ from tdf_jax.pointcloud import sample_surface
 from tdf_jax.shapes import Mug, build_mug, sample_mug, scaled
 
 SEED_SPACE = 7_000_001  # keeps evaluation objects apart from training's, which are drawn from [seed, index]
+# Folded into the key of random poses: start m of a seed is drawn from fold_in(key(seed), m), and must not be the true rotation.
+POSE_STREAM = 0x7D05E
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +45,7 @@ def mug_of(seed: int, index: int, height: float) -> Mug:
 
 def random_pose(seed: int, index: int, reach: float = 0.3) -> Float[np.ndarray, "4 4"]:
     """A rotation uniform on SO(3) and a translation uniform in a cube of half side `reach`, metres."""
-    rotation_key, place_key = jax.random.split(jax.random.fold_in(jax.random.key(seed), index))
+    rotation_key, place_key = jax.random.split(jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), POSE_STREAM), index))
     T = np.eye(4)
     T[:3, :3] = poses.uniform_rotations(rotation_key, 1)[0]
     T[:3, 3] = jax.random.uniform(place_key, (3,), minval=-reach, maxval=reach)

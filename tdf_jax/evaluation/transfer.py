@@ -14,7 +14,7 @@ from tdf_jax.energy import EnergyWeights
 from tdf_jax.evaluation.cases import Case
 from tdf_jax.evaluation.truth import FLIP_DEGREES, pose_error
 from tdf_jax.model import Model, encode
-from tdf_jax.optimize import OptimizeConfig, optimize
+from tdf_jax.optimize import OptimizeConfig, optimize, random_starts
 from tdf_jax.query import box_query
 from tdf_jax.trajectory import Trajectory
 
@@ -45,9 +45,10 @@ def transfer_errors(
     for index, case in enumerate(tqdm(cases, desc="transferring", disable=not progress)):
         reference = place_reference(model, case, query)
         field = encode(model, thinned(model, case.points_b))
-        result = optimize(
-            field, reference, jax.random.fold_in(start_key, index), fix_last=False, energy=EnergyWeights(0.0), config=config
-        )
+        key = jax.random.fold_in(start_key, index)
+        # Given as they are: drawn inside, every start's last pose, here its only one, would be set to the goal.
+        starts = random_starts(key, field, reference, config.inits, config.start, config.start_radius)
+        result = optimize(field, reference, key, fix_last=False, energy=EnergyWeights(0.0), config=config, starts=starts)
         truth = case.T_world_place_b
         errors.append(pose_error(result.trajectory.wxyz_xyz[0], poses.pose(jnp.asarray(truth[:3, :3]), jnp.asarray(truth[:3, 3]))))
     distance, angle = np.array(errors).T

@@ -30,12 +30,13 @@ STYLE = {"font.size": 8, "axes.titlesize": 9, "figure.titlesize": 9.5, "legend.f
 DPI = 200
 SHOWN_POINTS = 1500  # of a cloud; more are a blot at the width of a page
 VIEW = {"elev": 22, "azim": -38}  # the handle faces the reader, the way to the place runs to the right
+LIGHT = np.array([0.13, -0.60, 0.79])  # from above the reader's left
 MOST_TRIANGLES = 40_000  # of a mesh that is drawn as such: 1 s of matplotlib
 
 
 @dataclasses.dataclass(frozen=True)
-class View:
-    """One side of the picture, in metres: the object, as triangles (faces, 3, 3) where they are known, and the paths."""
+class _View:
+    """One side of the picture, in metres: the object, as triangles where they are known, and the paths."""
 
     points: Float[np.ndarray, "points 3"]
     triangles: Float[np.ndarray, "faces 3 3"] | None
@@ -68,21 +69,23 @@ def imitation_figure(
     triangles = [None if mesh is None else np.asarray(mesh.triangles) for mesh in meshes]
     triangles = [None if corners is None or len(corners) > MOST_TRIANGLES else corners for corners in triangles]
     views = {
-        "reference": View(np.asarray(demonstration.points), triangles[0], demonstration.trajectory, None),
-        "test": View(np.asarray(points), triangles[1], trajectory, expected),
+        "reference": _View(np.asarray(demonstration.points), triangles[0], demonstration.trajectory, None),
+        "test": _View(np.asarray(points), triangles[1], trajectory, expected),
     }
     contents = [_content(view, box) for view in views.values()]
     size = np.max([np.ptp(content, axis=0) for content in contents], axis=0) * 1.06
     with matplotlib.rc_context(STYLE):
-        figure = _figure(7.2, 4.2)
+        figure = _figure(7.2, 4.5)
+        legend = {}
         for column, (name, view) in enumerate(views.items()):
-            axes = figure.add_axes((0.5 * column - 0.005, 0.1, 0.46, 0.86), projection="3d")
+            axes = figure.add_axes((0.5 * column - 0.005, 0.17, 0.46, 0.74), projection="3d")
             _draw_view(axes, view, box)
             _frame(axes, contents[column], size)
-            axes.set_title(name, y=0.98)
+            axes.set_title(name, y=0.99)
+            legend |= _legend(axes)
         _waypoint_bar(figure, trajectory.poses)
-        handles, labels = axes.get_legend_handles_labels()
-        figure.legend(handles, labels, loc="lower left", bbox_to_anchor=(0.02, 0.01), frameon=False)
+        placing = {"loc": "lower left", "bbox_to_anchor": (0.02, 0.0), "frameon": False}
+        figure.legend(legend.values(), legend.keys(), **placing)
         figure.suptitle(title, y=0.98)
     return figure
 
@@ -104,9 +107,9 @@ def loss_figure(losses: Float[np.ndarray, "inits iterations"], best: int, title:
             if index != best:
                 axes.plot(steps, row, color=CLOUD, lw=0.7, alpha=0.8, label="other starts")
         axes.plot(steps, losses[best], color=COLOURS(0.35), lw=2.0, label=f"best, start {best + 1} of {len(losses)}")
-        handles = {label: handle for handle, label in zip(*axes.get_legend_handles_labels())}
-        axes.legend(handles.values(), handles.keys(), frameon=False)
-        axes.set(xlabel="iteration", ylabel="loss (no unit)", title=title, xlim=(0, steps[-1]))
+        legend = _legend(axes)
+        axes.legend(legend.values(), legend.keys(), frameon=False)
+        axes.set(xlabel="iteration", ylabel="loss (no unit)", title=title, xlim=(0, max(1, steps[-1])))
         axes.set_ylim(bottom=0)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.spines[["top", "right"]].set_visible(False)
@@ -130,6 +133,11 @@ def _figure(width: float, height: float, layout: str | None = None) -> Figure:
     return figure
 
 
+def _legend(axes) -> dict:
+    """One handle a label."""
+    return {label: handle for handle, label in zip(*axes.get_legend_handles_labels())}
+
+
 def _bounds(query):
     """Corners (8, 3) of the query points' bounding box, in the query frame."""
     low, high = query.min(axis=0), query.max(axis=0)
@@ -142,37 +150,32 @@ def _carried(trajectory, box):
     return np.einsum("nij,cj->nci", R, box) + t[:, None]
 
 
-def _content(view: View, box):
+def _content(view: _View, box):
     """Every point that a view has to show."""
     paths = [path for path in (view.trajectory, view.expected) if path is not None]
     return np.concatenate([view.points, *(_carried(path, box).reshape(-1, 3) for path in paths)])
 
 
-def _draw_view(axes: Axes3D, view: View, box) -> None:
-    light = _direction(VIEW["azim"] - 40, VIEW["elev"] + 30)
-    pieces = solid.surface(CENTIMETRES * view.triangles, light) if view.triangles is not None else solid.Pieces([], [], [])
+def _draw_view(axes: Axes3D, view: _View, box) -> None:
+    pieces = solid.Pieces([], [], [])
     if view.triangles is None:
         cloud = view.points[:: -(-len(view.points) // SHOWN_POINTS)]
         axes.scatter(*(CENTIMETRES * cloud.T), s=2.4, color=CLOUD, linewidths=0, label="object's points")
+    else:
+        pieces += solid.surface(CENTIMETRES * view.triangles, LIGHT)
     corners = CENTIMETRES * _carried(view.trajectory, box)
     for fraction, one in zip(np.linspace(0, 1, len(corners)), corners):
         pieces += solid.box(one, COLOURS(fraction))
     if view.expected is not None:
         pieces += solid.box(CENTIMETRES * _carried(view.expected, box)[0], TRUTH, filled=False, dashed=True)
-    axes.add_collection3d(pieces.collection())
     axes.computed_zorder = False
+    axes.add_collection3d(pieces.collection())
     line = {"lw": 1.2, "marker": "o", "ms": 2.5}
     if view.expected is not None:
         path = CENTIMETRES * np.asarray(view.expected.translations)
-        axes.plot(*path.T, color=TRUTH, ls=(0, (3, 2)), mfc="white", zorder=5, label="true trajectory and pick box", **line)
+        axes.plot(*path.T, color=TRUTH, ls=(0, (3, 2)), mfc="white", zorder=5, label="true trajectory and pick", **line)
     path = CENTIMETRES * np.asarray(view.trajectory.translations)
     axes.plot(*path.T, color=INK, zorder=6, label="trajectory of the query frame", **line)
-
-
-def _direction(azimuth: float, elevation: float):
-    """Unit vector, from degrees."""
-    a, e = np.radians(azimuth), np.radians(elevation)
-    return np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
 
 
 def _frame(axes: Axes3D, content, size) -> None:
@@ -186,7 +189,7 @@ def _frame(axes: Axes3D, content, size) -> None:
         axis.set_pane_color((0.97, 0.97, 0.97))
         axis._axinfo["grid"].update(color=(0.87, 0.87, 0.87), linewidth=0.5)
     axes.tick_params(pad=-2, labelsize=7)
-    axes.set_box_aspect(tuple(size), zoom=1.03)  # a copy: matplotlib changes an array in place
+    axes.set_box_aspect(tuple(size), zoom=1.01)  # a copy: matplotlib changes an array in place
     axes.patch.set_visible(False)
     axes.view_init(**VIEW)
 

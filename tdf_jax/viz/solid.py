@@ -1,7 +1,7 @@
 """Solid things in matplotlib's 3-D axes, cut into small pieces.
 
-Matplotlib has no depth buffer: it paints polygons from far to near by their mean depth, and each collection as a whole. Mug,
-boxes and lines hide each other rightly only as small pieces of one collection.
+Matplotlib has no depth buffer: it paints a collection's polygons from far to near by their mean depth, and collections
+one after the other. A mug, boxes and lines hide each other rightly only as small pieces of one collection.
 """
 
 import dataclasses

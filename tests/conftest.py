@@ -1,0 +1,170 @@
+"""What the tests share: golden outputs of the original network, a small random network, and a count of compilations."""
+
+import contextlib
+import dataclasses
+import os
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax.traverse_util import unflatten_dict
+from scipy.spatial.transform import Rotation
+
+import tdf_jax as tdf
+from tdf_jax.field import DescriptorField
+from tdf_jax.network import OccupancyNetwork, condition, parameter_shapes
+
+jax.config.update("jax_debug_nans", True)
+
+GOLDEN = {32: Path(__file__).parent / "fixtures"}
+# The golden outputs of the full-size network are too large to keep here; name their folder to test those as well.
+if "TDF_GOLDEN_DIR" in os.environ:
+    GOLDEN[256] = Path(os.environ["TDF_GOLDEN_DIR"])
+
+TOLERANCE = {"float32": 5e-5, "float64": 1e-10}
+SMALL = tdf.NetworkConfig(latent=4, vector_hidden=6, vector_width=12, decoder_width=8, blocks=2)
+
+
+def relative_error(found, expected) -> float:
+    """||a - b|| / ||b||."""
+    expected = np.asarray(expected, np.float64)
+    found = np.asarray(found, np.float64)
+    assert found.shape == expected.shape
+    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+
+
+def cast(tree, dtype):
+    """A pytree of numbers in another precision; float64 needs `jax.enable_x64`."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), tree)
+
+
+def random_poses(seed, count, reach=0.1):
+    """Poses `wxyz_xyz` (count, 7): uniform rotations, translations about `reach` metres long."""
+    rng = np.random.default_rng(seed)
+    wxyz = rng.normal(size=(count, 4))
+    return np.concatenate([wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True), reach * rng.normal(size=(count, 3))], axis=1)
+
+
+def carried(pose, points):
+    """Points carried by one pose, by scipy, float64."""
+    pose = np.asarray(pose, np.float64)
+    return Rotation.from_quat(pose[:4], scalar_first=True).apply(np.array(points, np.float64)) + pose[4:]
+
+
+def composed(motion, wxyz_xyz):
+    """Poses carried by one pose, by scipy, float64."""
+    turn, wxyz_xyz = Rotation.from_quat(motion[:4], scalar_first=True), np.array(wxyz_xyz, np.float64)
+    turned = turn * Rotation.from_quat(wxyz_xyz[:, :4], scalar_first=True)
+    return np.concatenate([turned.as_quat(scalar_first=True), carried(motion, wxyz_xyz[:, 4:])], axis=1)
+
+
+def random_cloud(seed, count=40):
+    """A lopsided cloud of a mug's size, away from the world's origin, float64."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(count, 3)) * (0.05, 0.03, 0.02) + rng.gamma(1.0, 0.03, size=(count, 3)) + (0.3, -0.2, 0.1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Golden:
+    """A checkpoint of the published layout and what the original network computes from it, in float64."""
+
+    model: tdf.Model
+    arrays: dict
+
+
+@pytest.fixture(scope="session", params=GOLDEN, ids=lambda size: f"latent{size}")
+def golden(request):
+    path = GOLDEN[request.param] / f"ndf_latent{request.param}"
+    with np.load(path.with_suffix(".npz")) as arrays:
+        return Golden(tdf.convert_checkpoint(path.with_suffix(".pth")), dict(arrays))
+
+
+@pytest.fixture(scope="session", params=TOLERANCE)
+def precision(request):
+    """"float32" or "float64": values are made under `enabled(precision)` and are of that type."""
+    return request.param
+
+
+def enabled(precision):
+    return jax.enable_x64(precision == "float64")
+
+
+@pytest.fixture(scope="session")
+def golden_encoded(golden, precision):
+    """Field, and the outputs of the encoder's layers, of the two golden objects.
+
+    Their clouds are centred to 1e-9 m; `tdf.encode` would centre them again, which moves the latents by 1e-6.
+    """
+    config = golden.model.config
+
+    @jax.jit
+    def encode(params, points):
+        latent, captured = OccupancyNetwork(config).apply(
+            {"params": params}, points, method="encode_latent", capture_intermediates=True, mutable=["intermediates"]
+        )
+        field = DescriptorField(condition(params, config, latent), jnp.zeros_like(points[0]))
+        return field, captured["intermediates"]["encoder"]
+
+    with enabled(precision):
+        params = cast(golden.model.params, precision)
+        return [encode(params, jnp.asarray(points, precision)) for points in golden.arrays["point_cloud"]]
+
+
+@pytest.fixture(scope="session")
+def golden_fields(golden_encoded):
+    """Fields of the two golden objects."""
+    return [field for field, _ in golden_encoded]
+
+
+@pytest.fixture(scope="session")
+def small_model():
+    """A random network of few channels, all of its biases in use."""
+    rng = np.random.default_rng(0)
+    tensors = {
+        name: jnp.asarray(rng.normal(size=shape) / np.sqrt(shape[0]), jnp.float32)
+        for name, shape in parameter_shapes(SMALL).items()
+    }
+    return tdf.Model(unflatten_dict(tensors, sep="."), SMALL, tdf.ModelInfo("small", "random numbers"))
+
+
+@pytest.fixture(scope="session")
+def demonstration():
+    """4 poses, 8 query points: with `random_cloud`s of 40 points, the shapes that most tests share, and compile once."""
+    return tdf.Demonstration(
+        jnp.asarray(random_cloud(0), jnp.float32),
+        tdf.Trajectory(jnp.asarray(random_poses(1, 4) + [0, 0, 0, 0, 0.3, -0.2, 0.1], jnp.float32)),
+        tdf.box_query(jax.random.key(2), count=8, size=0.05, centre=(0.01, 0.02, 0.03)),
+    )
+
+
+@pytest.fixture(scope="session")
+def reference(small_model, demonstration):
+    return tdf.describe(small_model, demonstration)
+
+
+@pytest.fixture(scope="session")
+def field(small_model):
+    """Of an object that was not demonstrated on."""
+    return tdf.encode(small_model, jnp.asarray(random_cloud(3), jnp.float32))
+
+
+@pytest.fixture(scope="session")
+def values():
+    """Descriptors and occupancies of a field at points, compiled once."""
+    return jax.jit(lambda field, x: (field.descriptors(x), field.occupancy(x)))
+
+
+_compiled = []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda event, _, **about: _compiled.append(about["fun_name"]) if event.endswith("backend_compile_duration") else None
+)
+
+
+@contextlib.contextmanager
+def compilations():
+    """Names of the functions compiled within, in order."""
+    start, names = len(_compiled), []
+    yield names
+    names += _compiled[start:]

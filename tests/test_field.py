@@ -1,0 +1,154 @@
+"""The descriptor field: what it returns, and how it moves with its object."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import SMALL, TOLERANCE, carried, enabled, random_cloud, random_poses, relative_error
+
+import tdf_jax as tdf
+from tdf_jax.errors import InputError
+
+# float32 coordinates half a metre away carry 3e-8 m, of offsets of 5 cm; the network's own rounding is 1e-5.
+EQUIVARIANCE = {"float32": 2e-4, "float64": 1e-10}
+
+
+def near(points, count=16, seed=5):
+    """Places around an object."""
+    rng = np.random.default_rng(seed)
+    return points[rng.integers(len(points), size=count)] + 0.03 * rng.normal(size=(count, 3))
+
+
+def test_descriptors_have_unit_length_and_occupancies_are_probabilities(field, values):
+    x = jnp.asarray(random_cloud(4, 500), jnp.float32)
+    descriptors, occupancy = values(field, x)
+    assert descriptors.shape == (500, SMALL.channels) and occupancy.shape == (500,)
+    np.testing.assert_allclose(np.linalg.norm(descriptors, axis=-1), 1, atol=1e-6)
+    assert (occupancy >= 0).all() and (occupancy <= 1).all() and np.ptp(occupancy) > 0.01
+
+
+def test_batch_axes(field, values):
+    x = jnp.asarray(random_cloud(4, 24), jnp.float32)
+    descriptors, occupancy = values(field, x)
+    d, o = values(field, x.reshape(2, 3, 4, 3))
+    assert d.shape == (2, 3, 4, SMALL.channels) and o.shape == (2, 3, 4)
+    np.testing.assert_allclose(d.reshape(24, -1), descriptors, atol=1e-6)
+    np.testing.assert_allclose(o.reshape(24), occupancy, atol=1e-6)
+    d, o = values(field, x[7])
+    np.testing.assert_allclose(d, descriptors[7], atol=1e-6)
+    assert o.shape == ()
+
+
+def test_the_origin_is_the_mean_of_the_points(field):
+    np.testing.assert_allclose(field.origin, random_cloud(3).mean(axis=0), atol=1e-6)
+    assert field.latent.shape == (SMALL.latent, 3)
+
+
+def test_precision_is_the_inputs(small_model, field, values):
+    x = jnp.asarray(random_cloud(4, 24), jnp.float32)
+    assert {field.latent.dtype, field.origin.dtype, *(v.dtype for v in values(field, x))} == {jnp.dtype("float32")}
+    with jax.enable_x64(True):  # float32 stays so where float64 is allowed, and float64 stays float64 on float32 weights
+        assert {v.dtype for v in values(field, x)} == {jnp.dtype("float32")}
+        double = tdf.encode(small_model, random_cloud(3))
+        assert double.latent.dtype == double.origin.dtype == jnp.dtype("float64")
+        assert {v.dtype for v in values(double, x.astype(float))} == {jnp.dtype("float64")}
+        assert relative_error(field.latent, double.latent) < TOLERANCE["float32"]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_field_moves_with_its_object(small_model, values, precision, seed):
+    """Latent vectors turn with the cloud; descriptors and occupancies are carried along."""
+    points, motion = random_cloud(seed), random_poses(seed, 1)[0]
+    x = near(points)
+    turn = motion * [1, 1, 1, 1, 0, 0, 0]
+    with enabled(precision):
+        still = tdf.encode(small_model, points.astype(precision))
+        moved = tdf.encode(small_model, carried(motion, points).astype(precision))
+        assert still.latent.dtype == precision
+        assert relative_error(moved.latent, carried(turn, still.latent)) < EQUIVARIANCE[precision]
+        assert relative_error(moved.latent, still.latent) > 0.1  # the turn is not a small one
+        at_rest, after = values(still, x.astype(precision)), values(moved, carried(motion, x).astype(precision))
+        for found, expected in zip(after, at_rest, strict=True):
+            assert relative_error(found, expected) < EQUIVARIANCE[precision]
+
+
+@pytest.mark.parametrize("shift", [(1.0, 0, 0), (0, -20.0, 3.0)])
+def test_translation_changes_nothing(small_model, values, shift):
+    """The shifts are exact in the clouds' 2^-20 m steps of float32, so that only the subtraction of the mean is tested."""
+    points = jnp.asarray(np.round(random_cloud(0) * 2**14) / 2**14, jnp.float32)
+    x = jnp.asarray(np.round(near(random_cloud(0)) * 2**14) / 2**14, jnp.float32)
+    still, moved = tdf.encode(small_model, points), tdf.encode(small_model, points + jnp.asarray(shift))
+    tolerance = EQUIVARIANCE["float32"] * max(1, np.abs(shift).max())  # of the mean's rounding
+    assert relative_error(moved.latent, still.latent) < tolerance
+    for found, expected in zip(values(moved, x + jnp.asarray(shift)), values(still, x), strict=True):
+        assert relative_error(found, expected) < tolerance
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_order_of_the_points_changes_nothing(small_model, precision, seed):
+    points = random_cloud(seed).astype(precision)
+    with enabled(precision):
+        first, second = (tdf.encode(small_model, cloud) for cloud in (points, np.random.default_rng(seed).permutation(points)))
+        assert relative_error(second.latent, first.latent) < EQUIVARIANCE[precision]
+        np.testing.assert_allclose(second.origin, first.origin, rtol=1e-6)
+
+
+def test_gradients_are_finite_everywhere(field):
+    """At the origin, at a point of the cloud and far away, where the field is flat."""
+    direction = jnp.asarray(np.random.default_rng(0).normal(size=SMALL.channels), jnp.float32)
+    gradients = jax.jit(jax.grad(lambda x: (field.descriptors(x) @ direction) + field.occupancy(x)))
+    for x in (field.origin, jnp.asarray(random_cloud(3)[0], jnp.float32)):
+        gradient = gradients(x)
+        assert np.isfinite(gradient).all() and np.linalg.norm(gradient) > 1e-3
+    assert np.isfinite(gradients(field.origin + jnp.array([1e6, -1e5, 0.0]))).all()
+
+
+def test_gradients_reach_the_points_of_the_least_cloud_where_some_coincide(small_model):
+    """21 points are enough, and duplicates have edges of length zero."""
+    points = jnp.asarray(np.tile(random_cloud(0, 7), (3, 1)), jnp.float32)
+    norm = jax.jit(jax.value_and_grad(lambda points: jnp.sum(tdf.encode(small_model, points).latent ** 2)))
+    value, gradient = norm(points)
+    assert np.isfinite(value) and np.isfinite(gradient).all() and np.linalg.norm(gradient) > 1e-3
+    with pytest.raises(InputError, match="20 points; expected at least 21"):
+        tdf.encode(small_model, random_cloud(0, 20))
+
+
+def spoiled(value):
+    points = random_cloud(0)
+    points[7, 1] = value
+    return points
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (np.zeros((0, 3)), "0 points"),
+        (random_cloud(0)[:, :2], "shape"),
+        (random_cloud(0)[None], "shape"),
+        (spoiled(np.nan), "1 of the 40 points"),
+        (spoiled(np.inf), "1 of the 40 points"),
+        (np.ones((40, 3)), "all equal"),
+    ],
+    ids=["none", "plane", "batch", "nan", "infinite", "equal"],
+)
+def test_bad_points_are_refused(small_model, points, message):
+    with pytest.raises(InputError, match=message):
+        tdf.encode(small_model, points)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (5, 2), (5, 1), (3, 5)])
+@pytest.mark.parametrize("function", ["descriptors", "occupancy"])
+def test_places_of_another_shape_are_refused(field, function, shape):
+    """(5, 1) would broadcast against the origin."""
+    with pytest.raises(InputError, match=rf"DescriptorField.{function}\(\): x has shape .*; expected \(..., 3\)"):
+        getattr(field, function)(np.zeros(shape))
+
+
+def test_a_field_is_a_pytree(field, values):
+    leaves, tree = jax.tree.flatten(field)
+    assert all(isinstance(leaf, jax.Array) for leaf in leaves)
+    shifted = dataclasses.replace(jax.tree.unflatten(tree, leaves), origin=field.origin + 1)
+    x = jnp.asarray(random_cloud(4, 24), jnp.float32)
+    np.testing.assert_allclose(values(shifted, x + 1)[0], values(field, x)[0], atol=1e-5)
