@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -72,7 +72,7 @@ def describe(model: Model, demonstrations: Demonstration | Sequence[Demonstratio
     Raises:
         InputError: no demonstration, something else, or demonstrations that differ in query points or number of poses.
     """
-    demonstrations = [demonstrations] if isinstance(demonstrations, Demonstration) else list(demonstrations)
+    demonstrations = list(demonstrations) if isinstance(demonstrations, Iterable) else [demonstrations]
     kinds = sorted({type(demo).__name__ for demo in demonstrations})
     if kinds != ["Demonstration"]:
         raise InputError(f"describe(): got {', '.join(kinds) or 'nothing'}; expected one or more of tdf.Demonstration")

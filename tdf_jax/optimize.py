@@ -204,7 +204,8 @@ def _check_goal(goal):
     values = np.asarray(goal)
     if values.shape != (7,) or not np.isfinite(values).all() or not values[:4].any():
         raise InputError(
-            f"optimize(): goal of shape {values.shape} is {values}; expected one finite pose wxyz_xyz, (7,), its quaternion not zero"
+            f"optimize(): goal of shape {values.shape} is {values}; expected one finite pose wxyz_xyz, (7,), "
+            "its quaternion not zero"
         )
 
 
@@ -222,11 +223,14 @@ def _random_starts(key, origin, reference, radius, *, inits, start):
 
 def _start(key, origin, reference, start, radius):
     n, dtype = reference.trajectory.poses, reference.trajectory.wxyz_xyz.dtype
-    turn_key, place_key = jax.random.split(key)
+    turn_key, way_key, far_key = jax.random.split(key, 3)
     if start == "carried":
         turn = poses.uniform_rotations(turn_key, 1)[0].astype(dtype)
         return reference.trajectory.transformed(poses.pose(turn, origin)).wxyz_xyz
-    place = jax.random.ball(place_key, 3, shape=(n,), dtype=dtype) * radius
+    # Uniform in the ball; `jax.random.ball` takes 2 s to compile.
+    way = jax.random.normal(way_key, (n, 3), dtype)
+    far = radius * jnp.cbrt(jax.random.uniform(far_key, (n, 1), dtype))
+    place = far * way / jnp.linalg.norm(way, axis=-1, keepdims=True)
     R = poses.uniform_rotations(turn_key, n).astype(dtype)
     centre = jnp.mean(reference.query, axis=0)
     return poses.pose(R, origin + place - poses.rotate(R, centre[None])[:, 0])
@@ -279,8 +283,8 @@ def _trajectories(state, starts, query, *, fix_last):
 def _evaluator(starts, field, reference, energy, fix_last, chunk):
     """Function from variables to every start's energy and its gradient with respect to the variables.
 
-    Equal to `jax.vmap(jax.value_and_grad(trajectory_energy))`, but a chunk of poses at a time. A fixed last pose is evaluated once a call,
-    not in every step, and has gradient zero.
+    Equal to `jax.vmap(jax.value_and_grad(trajectory_energy))`, but a chunk of poses at a time. A fixed last pose is
+    evaluated once, not in every step, and has gradient zero.
     """
     inits, n = starts.shape[:2]
     free = n - 1 if fix_last else n

@@ -18,6 +18,19 @@ from tdf_jax.network import OccupancyNetwork, condition, parameter_shapes
 
 jax.config.update("jax_debug_nans", True)
 
+
+def pytest_runtest_setup(item):
+    """LLVM's optimisation is half of a compilation and changes rounding only. Parity, and what runs for long, keeps it."""
+    names = item.fixturenames
+    quick = "quick_compilation" in names or ("small_model" in names and "golden" not in names)
+    jax.config.update("jax_disable_most_optimizations", quick)
+
+
+@pytest.fixture(scope="session")
+def quick_compilation():
+    """For tests of tiny programs that are slow to compile."""
+
+
 GOLDEN = {32: Path(__file__).parent / "fixtures"}
 # The golden outputs of the full-size network are too large to keep here; name their folder to test those as well.
 if "TDF_GOLDEN_DIR" in os.environ:

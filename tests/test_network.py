@@ -108,7 +108,7 @@ def plain_edge_convolution(params, points, neighbours, slope):
     return jnp.mean(jnp.where(inner >= 0, feature, reflected), axis=1)
 
 
-def test_the_edge_convolution_and_its_gradient_are_those_of_the_plain_form():
+def test_the_edge_convolution_and_its_gradient_are_those_of_the_plain_form(quick_compilation):
     with jax.enable_x64(True):
         points = jnp.asarray(10 * random_cloud(0))
         module = EdgeConvolution(channels=6, neighbours=5, slope=0.2)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 SHAPES = {"line": line, "semicircle": semicircle, "wave": wave}
 MUG_HEIGHT = 0.12  # metres
-QUERY_SIZE = 0.08  # metres, edge of the box of query points about the handle
+QUERY_SIZE = 0.06  # metres, edge of the box of query points about the handle
 PLACE = (0.0, 0.24, 0.18)  # metres from the pick: 0.30 m away, to the handle's side and up
 LIFT = (0.0, 0.0, 1.0)  # a semicircle and a wave leave the straight line upwards first
 

@@ -19,7 +19,7 @@ from tdf_jax.query import box_query
 from tdf_jax.trajectory import Trajectory
 
 QUERIES = 128
-QUERY_SIZE = 0.08  # metres, of the box around the place
+QUERY_SIZE = 0.06  # metres, of the box around the place: the handle and the wall behind it
 THRESHOLDS = ((0.01, 10.0), (0.02, 20.0))  # metres, degrees
 RESAMPLES = 2000  # of the bootstrap
 

@@ -1,0 +1,135 @@
+"""The whole way in one call: one target and many, goals, several demonstrations, bad input."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import compilations, random_cloud, random_poses
+
+import tdf_jax as tdf
+from tdf_jax.errors import InputError
+from tdf_jax.pointcloud import thin
+
+CONFIG = tdf.OptimizeConfig(inits=3, iterations=5)
+KEY = jax.random.key(0)
+TARGET = random_cloud(3).astype(np.float32)
+
+
+def assert_equal(found, expected):
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.fixture(scope="module")
+def imitate(small_model):
+    def call(demonstration, points=TARGET, key=KEY, **settings):
+        return tdf.imitate(small_model, demonstration, points, key=key, **{"config": CONFIG} | settings)
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def result(imitate, demonstration):
+    return imitate(demonstration)
+
+
+def test_it_is_describe_encode_optimize(result, field, reference):
+    assert_equal(result, tdf.optimize(field, reference, KEY, config=CONFIG))
+    assert isinstance(result.trajectory, tdf.Trajectory) and result.trajectory.poses == 4
+    assert result.losses.shape == (3, 5)
+
+
+def test_a_reference_can_be_shared_between_calls(imitate, demonstration, result, reference):
+    assert_equal(imitate(reference), result)
+    assert_equal(imitate([demonstration]), result)
+
+
+def test_several_demonstrations(imitate, small_model, demonstration, result):
+    other = dataclasses.replace(demonstration, points=random_cloud(7).astype(np.float32))
+    both = imitate([demonstration, other])
+    assert_equal(both, imitate(tdf.describe(small_model, [demonstration, other])))
+    assert_equal(both.starts, result.starts)  # the first one's trajectory
+    assert np.abs(both.losses - result.losses).min() > 1e-6
+
+
+def test_the_goal_is_the_demonstrations_carried_by_the_centroids(result, demonstration):
+    expected = np.array(demonstration.trajectory.wxyz_xyz[-1], np.float64)
+    expected[4:] += random_cloud(3).mean(axis=0) - random_cloud(0).mean(axis=0)
+    np.testing.assert_allclose(result.trajectory.wxyz_xyz[-1], expected, atol=1e-6)
+
+
+def test_goal_and_offset(imitate, reference, result):
+    goal, offset = random_poses(9, 1)[0].astype(np.float32), (-0.2, 0.1, 0.3)
+    np.testing.assert_array_equal(imitate(reference, goal=goal).trajectories[:, -1], np.tile(goal, (3, 1)))
+    shifted = np.array(result.trajectory.wxyz_xyz[-1]) + np.pad(np.float32(offset), (4, 0))
+    np.testing.assert_allclose(imitate(reference, goal_offset=offset).trajectory.wxyz_xyz[-1], shifted, atol=1e-7)
+    both = imitate(reference, goal=goal, goal_offset=np.array(offset))
+    np.testing.assert_allclose(both.trajectory.wxyz_xyz[-1], goal + np.pad(np.float32(offset), (4, 0)), atol=1e-7)
+    whole = imitate(reference, goal=[1, 0, 0, 0, 0, 0, 1])  # whole numbers
+    np.testing.assert_array_equal(whole.trajectory.wxyz_xyz[-1], [1, 0, 0, 0, 0, 0, 1])
+
+
+def test_dense_clouds_are_thinned_to_the_networks_density(small_model, reference, result):
+    dense = np.concatenate([TARGET, TARGET + np.float32(1e-3)])
+    model = dataclasses.replace(small_model, info=tdf.ModelInfo("small", "random numbers", cloud_points=40))
+    found = tdf.imitate(model, reference, dense, key=KEY, config=CONFIG)
+    assert_equal(found, tdf.imitate(small_model, reference, thin(dense, 40), key=KEY, config=CONFIG))
+
+
+def test_a_batch_is_every_target_with_a_key_of_its_own(small_model, imitate, demonstration, reference):
+    clouds = [random_cloud(seed).astype(np.float32) for seed in (3, 20, 21)]
+    with compilations() as compiled:
+        results = tdf.imitate_batch(small_model, demonstration, iter(clouds), key=KEY, config=CONFIG)
+    assert not {"jit(_run)", "jit(_encode)", "jit(_begin)"} & set(compiled)  # one program, compiled above
+    assert len(results) == 3
+    for index, (found, cloud) in enumerate(zip(results, clouds, strict=True)):
+        assert_equal(found, imitate(reference, cloud, key=jax.random.fold_in(KEY, index)))
+
+
+def test_a_batch_shares_its_settings(small_model, reference):
+    results = tdf.imitate_batch(small_model, reference, [TARGET] * 2, key=KEY, config=CONFIG, goal_offset=(0, 0, 1))
+    np.testing.assert_allclose(results[0].trajectory.wxyz_xyz[-1], results[1].trajectory.wxyz_xyz[-1])
+    assert np.abs(results[0].starts - results[1].starts).max() > 0.01
+
+
+def test_progress_is_passed_on(imitate, reference):
+    calls = []
+    imitate(reference, progress=lambda done, energies: calls.append((done, energies.shape)))
+    assert calls == [(5, (3,))]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"points": TARGET[:20]}, "20 points; expected at least 21"),
+        ({"points": TARGET * np.float32(np.nan)}, "NaN or infinite"),
+        ({"points": np.zeros((40, 3))}, "all equal"),
+        ({"points": TARGET[:, :2]}, "shape"),
+        ({"goal": np.zeros(6)}, r"goal has shape \(6,\); expected \(7,\)"),
+        ({"goal": np.full(7, np.inf)}, "goal is .*expected finite"),
+        ({"goal": np.zeros(7)}, "quaternion not zero"),
+        ({"goal_offset": (0, 1)}, r"goal_offset has shape \(2,\); expected \(3,\)"),
+        ({"goal_offset": (0, 1, np.nan)}, "goal_offset is .*expected finite"),
+    ],
+)
+def test_bad_input_is_refused(imitate, reference, settings, message):
+    with pytest.raises(InputError, match=message):
+        imitate(reference, **settings)
+
+
+def test_what_is_no_demonstration_is_refused(small_model):
+    for call in (tdf.imitate, tdf.imitate_batch):
+        with pytest.raises(InputError, match="expected one or more of tdf.Demonstration"):
+            call(small_model, tdf.wave(), [TARGET], key=KEY)
+
+
+def test_no_clouds_are_refused(small_model, reference):
+    with pytest.raises(InputError, match=r"imitate_batch\(\): there are no clouds"):
+        tdf.imitate_batch(small_model, reference, [], key=KEY)
+
+
+def test_one_cloud_is_no_batch(small_model, reference):
+    with pytest.raises(InputError, match="shape"):
+        tdf.imitate_batch(small_model, reference, TARGET, key=KEY)
