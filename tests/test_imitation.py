@@ -78,11 +78,11 @@ def test_dense_clouds_are_thinned_to_the_networks_density(small_model, reference
     assert_equal(found, tdf.imitate(small_model, reference, thin(dense, 40), key=KEY, config=CONFIG))
 
 
-def test_a_batch_is_every_target_with_a_key_of_its_own(small_model, imitate, demonstration, reference):
+def test_a_batch_is_every_target_with_a_key_of_its_own(small_model, imitate, demonstration, reference, result):
     clouds = [random_cloud(seed).astype(np.float32) for seed in (3, 20, 21)]
     with compilations() as compiled:
         results = tdf.imitate_batch(small_model, demonstration, iter(clouds), key=KEY, config=CONFIG)
-    assert not {"jit(_run)", "jit(_encode)", "jit(_begin)"} & set(compiled)  # one program, compiled above
+    assert not {"jit(_run)", "jit(_encode)", "jit(_begin)"} & set(compiled)  # one program, compiled for `result`
     assert len(results) == 3
     for index, (found, cloud) in enumerate(zip(results, clouds, strict=True)):
         assert_equal(found, imitate(reference, cloud, key=jax.random.fold_in(KEY, index)))

@@ -88,6 +88,17 @@ def test_the_first_step_has_the_rates_of_the_settings(field, reference):
     np.testing.assert_allclose(turned[:, :-1], 0.02 * np.sqrt(3), rtol=0.01)
 
 
+def test_rates_fall_as_a_cosine(field, reference):
+    """Far from a goal that pulls alone, the gradient keeps its direction, and Adam's steps are as long as the rate."""
+    config = dataclasses.replace(CONFIG, iterations=25, translation_rate=0.004, final_rate=0.1)
+    far = jnp.asarray(np.tile(random_poses(0, 4) * [1, 1, 1, 1, 0, 0, 0] + [0, 0, 0, 0, 9, 9, 9], (3, 1, 1)), jnp.float32)
+    result = run(field, reference, config=config, energy=tdf.EnergyWeights(1e3, lever=0.0), starts=far)
+    decay = 0.1 + 0.9 * (1 + np.cos(np.pi * np.arange(25) / 25)) / 2
+    centre = jnp.mean(reference.query, axis=0)[None]
+    moved = poses.transform(result.trajectories, centre) - poses.transform(result.starts, centre)
+    np.testing.assert_allclose(moved[:, :-1], -0.004 * decay.sum(), rtol=0.02)
+
+
 # ---- bookkeeping ----
 
 
