@@ -108,7 +108,7 @@ def enabled(precision):
 def golden_encoded(golden, precision):
     """Field, and the outputs of the encoder's layers, of the two golden objects.
 
-    Their clouds are centred to 1e-9 m; `tdf.encode` would centre them again, which moves the latents by 1e-6.
+    Their clouds are centred to 1e-9 m and taken as they are, as the original does.
     """
     config = golden.model.config
 
