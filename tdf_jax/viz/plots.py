@@ -169,7 +169,9 @@ def _draw_view(axes: Axes3D, view: _View, box) -> None:
     if view.expected is not None:
         pieces += solid.box(CENTIMETRES * _carried(view.expected, box)[0], TRUTH, filled=False, dashed=True)
     axes.computed_zorder = False
-    axes.add_collection3d(pieces.collection())
+    # `_frame` sets the limits. Left to matplotlib, they are taken over polygons padded to one length with uninitialised
+    # memory: once in a while an overflow.
+    axes.add_collection3d(pieces.collection(), autolim=False)
     line = {"lw": 1.2, "marker": "o", "ms": 2.5}
     if view.expected is not None:
         path = CENTIMETRES * np.asarray(view.expected.translations)
