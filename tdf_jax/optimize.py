@@ -155,7 +155,7 @@ def optimize(
         All starts' results.
 
     Raises:
-        InputError: starts or goal of a wrong shape or not finite, or a reference from another network than the field.
+        InputError: starts, goal or weights of a wrong shape or value, or a reference from another network than the field.
     """
     channels = field.conditioned.config.channels
     if reference.descriptors.shape[-1] != channels:
@@ -176,6 +176,7 @@ def optimize(
         )
     # One type of every traced number: mixed ones promote, and a weight of 0 for 0.02 would compile again.
     dtype = jnp.result_type(starts, reference.query, reference.descriptors, field.latent)
+    _check_weights(energy)
     energy = jax.tree.map(lambda weight: jnp.asarray(weight, dtype), energy)
     starts, state = _begin(starts.astype(dtype), None if goal is None else jnp.asarray(goal, dtype), reference.query)
     check_trajectory(Trajectory(np.reshape(starts, (-1, 7))), "starts")
@@ -198,6 +199,14 @@ def optimize(
 def default_goal(field: DescriptorField, reference: Reference) -> Float[Array, "7"]:
     """The demonstration's last pose, carried by the centroids."""
     return reference.trajectory.shifted(field.origin).wxyz_xyz[-1]
+
+
+def _check_weights(energy):
+    # Here, not where they are made: a gradient with respect to the weights is an EnergyWeights too, and may be negative.
+    for name in ("correlation", "compensator", "lever"):
+        value = getattr(energy, name)
+        if not isinstance(value, jax.core.Tracer) and not (np.ndim(value) == 0 and 0 <= float(value) < np.inf):
+            raise InputError(f"optimize(): energy.{name} is {value}; expected one finite number of 0 or more")
 
 
 def _check_goal(goal):

@@ -89,7 +89,7 @@ class Trajectory:
 
     def shifted(self, offset: Float[Array, "3"]) -> "Trajectory":
         """The trajectory with a vector, metres, added to every translation."""
-        return Trajectory(self.wxyz_xyz.at[..., 4:].add(offset))
+        return Trajectory(jnp.concatenate([self.wxyz_xyz[..., :4], self.translations + jnp.asarray(offset)], axis=-1))
 
     def displaced(self, offset: Float[Array, "3"], where: Literal["start", "goal"] = "goal") -> "Trajectory":
         """The trajectory with one end moved; see `displace`."""

@@ -20,7 +20,7 @@ jax.config.update("jax_debug_nans", True)
 
 
 def pytest_runtest_setup(item):
-    """LLVM's optimisation is half of a compilation and changes rounding only. Parity, and what runs for long, keeps it."""
+    """LLVM's optimisation is half of a compilation and changes rounding only; parity, and what runs long, keep it."""
     names = item.fixturenames
     quick = "quick_compilation" in names or ("small_model" in names and "golden" not in names)
     jax.config.update("jax_disable_most_optimizations", quick)
@@ -57,7 +57,8 @@ def random_poses(seed, count, reach=0.1):
     """Poses `wxyz_xyz` (count, 7): uniform rotations, translations about `reach` metres long."""
     rng = np.random.default_rng(seed)
     wxyz = rng.normal(size=(count, 4))
-    return np.concatenate([wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True), reach * rng.normal(size=(count, 3))], axis=1)
+    wxyz /= np.linalg.norm(wxyz, axis=1, keepdims=True)
+    return np.concatenate([wxyz, reach * rng.normal(size=(count, 3))], axis=1)
 
 
 def carried(pose, points):
@@ -144,7 +145,7 @@ def small_model():
 
 @pytest.fixture(scope="session")
 def demonstration():
-    """4 poses, 8 query points: with `random_cloud`s of 40 points, the shapes that most tests share, and compile once."""
+    """4 poses, 8 query points: with clouds of 40 points, the shapes that most tests share, to compile once."""
     return tdf.Demonstration(
         jnp.asarray(random_cloud(0), jnp.float32),
         tdf.Trajectory(jnp.asarray(random_poses(1, 4) + [0, 0, 0, 0, 0.3, -0.2, 0.1], jnp.float32)),
@@ -170,9 +171,14 @@ def values():
 
 
 _compiled = []
-jax.monitoring.register_event_duration_secs_listener(
-    lambda event, _, **about: _compiled.append(about["fun_name"]) if event.endswith("backend_compile_duration") else None
-)
+
+
+def _note(event, duration, **about):
+    if event.endswith("backend_compile_duration"):
+        _compiled.append(about["fun_name"])
+
+
+jax.monitoring.register_event_duration_secs_listener(_note)
 
 
 @contextlib.contextmanager

@@ -28,7 +28,9 @@ def test_a_trajectory_descriptor_stacks_those_of_its_poses(field, values):
 
 @pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
 @pytest.mark.parametrize(
-    "query", [QUERY[:, :2], QUERY[0], QUERY[:0], QUERY[None], QUERY * np.inf], ids=["plane", "one", "none", "batch", "infinite"]
+    "query",
+    [QUERY[:, :2], QUERY[0], QUERY[:0], QUERY[None], QUERY * np.inf],
+    ids=["plane", "one", "none", "batch", "infinite"],
 )
 def test_bad_query_points_are_refused(field, query, array):
     """jax clamps an index beyond the end: (queries, 2) would be taken for (queries, 3) with z = y."""

@@ -113,8 +113,8 @@ def coordinates_reference(query, *rows):
 
 def test_equation_2_is_the_mean_absolute_difference():
     reference = coordinates_reference([(0, 0, 0), (1, 0, 0)], (IDENTITY, (0, 0, 0)), (IDENTITY, (0, 1, 0)))
-    # Pose 0: off by (0.3, 0, -0.6) at both query points, 1.8 in sum. Pose 1: the query point (1, 0, 0) goes to (0, 1, 0)
-    # instead, 2 in sum. Means over 2 poses x 2 queries x 3 channels.
+    # Pose 0: off by (0.3, 0, -0.6) at both query points, 1.8 in sum. Pose 1: the query point (1, 0, 0) goes to
+    # (0, 1, 0) instead, 2 in sum. Means over 2 poses x 2 queries x 3 channels.
     found = trajectory((IDENTITY, (1.3, 2, 2.4)), (QUARTER_TURN_Z, (1, 3, 3)))
     np.testing.assert_allclose(tdf.descriptor_loss(found, Coordinates(), reference), (1.8 + 2) / 12, rtol=1e-6)
 
@@ -215,7 +215,7 @@ def test_an_unknown_norm_is_refused():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_descriptor_loss_is_unchanged_when_object_and_trajectory_move_together(golden, golden_reference, precision, seed):
+def test_the_descriptor_loss_is_unchanged_when_all_moves_together(golden, golden_reference, precision, seed):
     motion, aside = random_poses(seed, 1)[0], np.array([1, 0, 0, 0, 0.3, -0.2, 0.1])
     with enabled(precision):
 
@@ -243,7 +243,8 @@ def gradient(request):
     def energy(variables, rotations, field, reference):
         turns, t = variables
         R = poses.exp(turns) @ rotations
-        each = jax.vmap(waypoint_loss, in_axes=(0, 0, None, None, 0))(R, t, field, reference.query, reference.descriptors)
+        losses = jax.vmap(waypoint_loss, in_axes=(0, 0, None, None, 0))
+        each = losses(R, t, field, reference.query, reference.descriptors)
         return jnp.mean(each) + pose_energy(R, t, field.origin, reference, weights)
 
     return jax.jit(jax.grad(energy))
@@ -254,10 +255,12 @@ def is_sound(gradient):
 
 
 @pytest.mark.parametrize(
-    "angles", [[0, 0, 0, 0], [np.pi, 0, np.pi, np.pi], [1e-20, 1e-6, np.pi - 1e-6, np.pi + 1e-6]], ids=["zero", "pi", "near"]
+    "angles",
+    [[0, 0, 0, 0], [np.pi, 0, np.pi, np.pi], [1e-20, 1e-6, np.pi - 1e-6, np.pi + 1e-6]],
+    ids=["zero", "pi", "near"],
 )
 def test_gradients_are_finite_at_zero_and_half_turns(gradient, field, reference, angles):
-    """The reference is not turned, so these are also the turns between it and the trajectory, and between neighbours."""
+    """The reference is not turned: these are also the turns from it to the trajectory, and between neighbours."""
     unturned = reference.trajectory.wxyz_xyz.at[:, :4].set(jnp.array(IDENTITY))
     reference = dataclasses.replace(reference, trajectory=tdf.Trajectory(unturned))
     turns = jnp.outer(jnp.asarray(angles, jnp.float32), jnp.array([0.6, 0.0, 0.8]))
@@ -267,7 +270,7 @@ def test_gradients_are_finite_at_zero_and_half_turns(gradient, field, reference,
 
 
 def test_gradients_are_finite_at_the_reference(gradient, field, reference):
-    """Eq. 3 has a kink where a pose is the reference's, as the fixed last pose often is; eq. 6 where two poses are equal."""
+    """Eq. 3 has a kink where a pose is the reference's, as the last one often is; eq. 6 where two poses are equal."""
     field = dataclasses.replace(field, origin=jnp.zeros(3))  # so that the poses are the reference's to the bit
     R, t = reference.trajectory.rotations, reference.trajectory.translations
     assert is_sound(gradient((jnp.zeros((4, 3)), t), R, field, reference))

@@ -49,7 +49,7 @@ def test_the_origin_is_the_mean_of_the_points(field):
 def test_precision_is_the_inputs(small_model, field, values):
     x = jnp.asarray(random_cloud(4, 24), jnp.float32)
     assert {field.latent.dtype, field.origin.dtype, *(v.dtype for v in values(field, x))} == {jnp.dtype("float32")}
-    with jax.enable_x64(True):  # float32 stays so where float64 is allowed, and float64 stays float64 on float32 weights
+    with jax.enable_x64(True):  # float32 stays so where float64 is allowed, float64 stays float64 on float32 weights
         assert {v.dtype for v in values(field, x)} == {jnp.dtype("float32")}
         double = tdf.encode(small_model, random_cloud(3))
         assert double.latent.dtype == double.origin.dtype == jnp.dtype("float64")
@@ -76,7 +76,7 @@ def test_a_field_moves_with_its_object(small_model, values, precision, seed):
 
 @pytest.mark.parametrize("shift", [(1.0, 0, 0), (0, -20.0, 3.0)])
 def test_translation_changes_nothing(small_model, values, shift):
-    """The shifts are exact in the clouds' 2^-20 m steps of float32, so that only the subtraction of the mean is tested."""
+    """Multiples of 2^-14 m stay exact under the shifts, so that only the subtraction of the mean is tested."""
     points = jnp.asarray(np.round(random_cloud(0) * 2**14) / 2**14, jnp.float32)
     x = jnp.asarray(np.round(near(random_cloud(0)) * 2**14) / 2**14, jnp.float32)
     still, moved = tdf.encode(small_model, points), tdf.encode(small_model, points + jnp.asarray(shift))
@@ -90,7 +90,8 @@ def test_translation_changes_nothing(small_model, values, shift):
 def test_the_order_of_the_points_changes_nothing(small_model, precision, seed):
     points = random_cloud(seed).astype(precision)
     with enabled(precision):
-        first, second = (tdf.encode(small_model, cloud) for cloud in (points, np.random.default_rng(seed).permutation(points)))
+        shuffled = np.random.default_rng(seed).permutation(points)
+        first, second = (tdf.encode(small_model, cloud) for cloud in (points, shuffled))
         assert relative_error(second.latent, first.latent) < EQUIVARIANCE[precision]
         np.testing.assert_allclose(second.origin, first.origin, rtol=1e-6)
 

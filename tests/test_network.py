@@ -95,7 +95,7 @@ def test_parity_fails_without_any_one_tensor(golden, mutation):
 
 
 def plain_edge_convolution(params, points, neighbours, slope):
-    """Edge features, vector linear map, vector leaky ReLU, mean over neighbours: as written in the papers, (points, 3, channels)."""
+    """Edge features, vector linear map, vector leaky ReLU, mean over neighbours: (points, 3, channels)."""
     x = points[:, None]
     distances = jnp.sum((x - points) ** 2, axis=-1)
     near = points[jnp.argsort(distances, axis=1)[:, :neighbours]]
@@ -124,8 +124,9 @@ def test_the_edge_convolution_and_its_gradient_are_those_of_the_plain_form(quick
             y = plain_edge_convolution(params, points, 5, 0.2)
             return jnp.sum(weights * y), y
 
-        (_, found), gradient = jax.jit(jax.value_and_grad(fast, argnums=(0, 1), has_aux=True))(params, points)
-        (_, expected), expected_gradient = jax.jit(jax.value_and_grad(plain, argnums=(0, 1), has_aux=True))(params, points)
+        gradients = (jax.jit(jax.value_and_grad(form, argnums=(0, 1), has_aux=True)) for form in (fast, plain))
+        values = [gradient(params, points) for gradient in gradients]
+        ((_, found), gradient), ((_, expected), expected_gradient) = values
         assert relative_error(found, expected) < 1e-12
         for a, b in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected_gradient), strict=True):
             assert relative_error(a, b) < 1e-10

@@ -1,4 +1,4 @@
-"""Training data with its labels, the batches drawn from it, and the loop: it learns, resumes exactly, refuses other settings."""
+"""Training data and its labels, the batches drawn from it, and the loop: it learns, and resumes exactly."""
 
 import dataclasses
 import functools
@@ -40,7 +40,7 @@ def objects():
 
 @pytest.fixture(scope="module")
 def train(quick_compilation):
-    """`loop.train` on small clouds. An optimiser is part of the step's cache key: kept, it is compiled once for all tests."""
+    """`loop.train` on small clouds. An optimiser is part of the step's cache key: kept, all tests compile it once."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "_optimiser", functools.cache(loop._optimiser))
         patch.setattr(data, "SPARSE_CLOUDS", (40, 300))
@@ -70,11 +70,12 @@ def test_data_are_a_function_of_the_seed(objects):
         first, once_more, different = (getattr(these, name)[0] for these in (objects, again, other))
         np.testing.assert_array_equal(once_more, first)
         assert np.mean(first != different) > 0.05
-    assert objects.surface.shape == (2, 400, 3) and objects.queries.shape == (2, 1000, 3) and objects.inside.shape == (2, 1000)
+    shapes = [array.shape for array in (objects.surface, objects.queries, objects.inside, objects.diagonals)]
+    assert shapes == [(2, 400, 3), (2, 1000, 3), (2, 1000), (2,)]
 
 
 def winding_numbers(mesh, points):
-    """How often a closed mesh winds around each point: 1 inside, 0 outside (the solid angles of Van Oosterom and Strackee)."""
+    """How often a closed mesh winds around each point, 1 inside, 0 outside, by Van Oosterom's solid angles."""
     corners = mesh.vertices[mesh.faces][None] - points[:, None, None]
     a, b, c = np.moveaxis(corners, 2, 0)
     A, B, C = (np.linalg.norm(corner, axis=-1) for corner in (a, b, c))
@@ -196,3 +197,13 @@ def test_a_loss_that_is_not_finite_stops_the_run(train, tmp_path, monkeypatch):
     with pytest.raises(FloatingPointError, match="the loss is nan at step 1; lower the learning rate"):
         train(CONFIG, tmp_path)
     assert not (tmp_path / "state.msgpack").exists()
+
+
+def test_metrics_cut_short_anywhere_are_dropped(tmp_path):
+    """A kill cuts the last line at any byte, also between the two closing braces of a row with a validation."""
+    whole, row = '{"step": 1, "loss": 2.0}', '{"step": 2, "loss": 1.0, "validation": {"iou": 0.5}}'
+    for cut in range(1, len(row)):
+        path = tmp_path / "metrics.jsonl"
+        path.write_text(whole + "\n" + row[:cut])
+        loop._drop_later_metrics(path, 2)
+        assert path.read_text() == whole + "\n"

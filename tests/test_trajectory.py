@@ -357,3 +357,9 @@ def test_wrong_paths(tmp_path):
     with pytest.raises(InputError, match="cannot write .*folder.tum"):
         save_trajectory(tmp_path / "folder.tum", line())
     assert [path.name for path in tmp_path.iterdir()] == ["folder.tum"]
+
+
+def test_shifted_takes_numpy_poses_and_changes_translations_only():
+    shown = Trajectory(np.tile(np.float32([0.6, 0.8, 0, 0, 1, 2, 3]), (2, 1)))
+    moved = shown.shifted(np.array([0.5, 0, -1]))
+    np.testing.assert_allclose(moved.wxyz_xyz, [[0.6, 0.8, 0, 0, 1.5, 2, 2]] * 2, rtol=1e-6)

@@ -200,8 +200,16 @@ def _restore(directory, params, state):
     return saved["params"], saved["state"], int(saved["step"])
 
 
+def _step_of(line):
+    """The step of a line of metrics; infinity for one that a kill cut short."""
+    try:
+        return json.loads(line)["step"]
+    except json.JSONDecodeError:
+        return float("inf")
+
+
 def _drop_later_metrics(path, step):
     """A run killed after its last checkpoint repeats some steps; their first lines go."""
     if path.exists():
-        rows = [line for line in path.read_text().splitlines() if line.endswith("}") and json.loads(line)["step"] <= step]
+        rows = [line for line in path.read_text().splitlines() if _step_of(line) <= step]
         replace_file("train", path, "".join(line + "\n" for line in rows).encode())
