@@ -105,8 +105,8 @@ def pose_energy(
     """What the energy adds to eq. 2: the weighted terms that depend on the poses alone.
 
     Args:
-        R, t: poses of the query frame in the world; matrices, for the optimiser has them and quaternions would cost it a third
-            of its compile time.
+        R, t: poses of the query frame in the world; matrices, for the optimiser has them: by way of quaternions it took 10.6
+            instead of 6.3 s of CPU to compile.
         origin: centroid of the new object's cloud, metres, world frame.
         reference: the demonstration's.
         weights: of the terms.

@@ -202,7 +202,8 @@ class VectorResidualBlock(nn.Module):
 
     def __call__(self, x: Vectors, pooled: Vectors | None = None) -> Vectors:
         """Args: x, and `pooled`, one point's channels to append to every point's, or None."""
-        # What is linear in the pooled half is computed once, not once for every point: a third of the encoder's work.
+        # What is linear in the pooled half is computed once, not once for every point: 651,000 multiply-adds
+        # a point and axis instead of 847,000.
         direction = _split_map(self.actvn_0.map_to_dir, x, pooled)
         shortcut = _split_map(self.shortcut.map_to_feat, x, pooled)
         if pooled is not None:

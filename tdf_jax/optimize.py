@@ -23,9 +23,9 @@ from tdf_jax.field import DescriptorField
 from tdf_jax.trajectory import Trajectory, check_trajectory
 
 STARTS = ("carried", "scattered")
-# About 512 descriptors of 2049 numbers (4 MB) with their activations stay in a core's cache.
+# 512 descriptors of 2049 numbers are 4 MB, meant to stay in cache; other sizes were not compared.
 CHUNK_POINTS = 512
-BLOCK = 20  # iterations of one compiled call: progress and cancellation between them cost nothing measurable
+BLOCK = 20  # iterations of one compiled call: progress and cancellation happen between calls
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +101,7 @@ class Result:
             InputError: no start stayed finite.
         """
         if not self.finite.any():
-            raise InputError(f"Result.best: {self.status}; lower the learning rate, or check the weights and the query points")
+            raise InputError(f"Result.best: {self.status}; lower rotation_rate and translation_rate, or check the weights and the query points")
         return int(np.argmin(np.where(self.finite, self.energies, np.inf)))
 
     @property
@@ -293,7 +293,7 @@ def _evaluator(starts, field, reference, energy, fix_last, chunk):
     """Function from variables to every start's energy and its gradient with respect to the variables.
 
     Equal to `jax.vmap(jax.value_and_grad(trajectory_energy))`, but a chunk of poses at a time. A fixed last pose is
-    evaluated once, not in every step, and has gradient zero.
+    evaluated once a call, not in every step, and has gradient zero.
     """
     inits, n = starts.shape[:2]
     free = n - 1 if fix_last else n

@@ -5,7 +5,7 @@ Poses are `wxyz_xyz` (..., 7), quaternion then translation in metres: the layout
 normalised on use, so any non-zero multiple of one is the same rotation, and they come out with w >= 0.
 
 Every function is differentiable with finite gradients everywhere, the identity and half turns included, and compiled:
-op by op, the first trajectory of a process would cost 30 small compilations.
+op by op, the first trajectory of a process would compile every operation on its own.
 """
 
 import jax

@@ -207,3 +207,22 @@ def test_metrics_cut_short_anywhere_are_dropped(tmp_path):
         path.write_text(whole + "\n" + row[:cut])
         loop._drop_later_metrics(path, 2)
         assert path.read_text() == whole + "\n"
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [{"steps": 0}, {"steps": 30}, {"batch": 0}, {"points": 20}, {"points": 2001}, {"queries": 0}, {"objects": 0}, {"seed": -1}]
+    + [{"learning_rate": float("nan")}, {"sparse": 1.5}, {"save_seconds": -1.0}, {"validate_every": 0}],
+)
+def test_bad_settings_are_refused_before_any_work(bad):
+    with pytest.raises(InputError, match=f"{next(iter(bad))} is"):
+        loop.TrainConfig(**bad)
+
+
+def test_a_damaged_run_is_refused(tmp_path):
+    (tmp_path / "config.json").write_text("{")
+    with pytest.raises(InputError, match="config.json cannot be read"):
+        loop._claim(loop.TrainConfig(), tmp_path)
+    (tmp_path / "state.msgpack").write_bytes(b"\x93\x01")
+    with pytest.raises(InputError, match="state.msgpack cannot be read"):
+        loop._restore(tmp_path, {}, {})

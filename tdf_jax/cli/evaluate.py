@@ -41,6 +41,8 @@ def evaluate(
 
     if pairs < 1:
         raise InputError(f"tdf evaluate: --pairs is {pairs}; expected at least 1")
+    if not 0 <= seed < 2**32:
+        raise InputError(f"tdf evaluate: --seed is {seed}; expected 0 to {2**32 - 1}")
     if not 0.01 <= height <= 1.0:
         raise InputError(f"tdf evaluate: --height is {height}; expected metres between 0.01 and 1")
     if place not in ("handle", "rim", "base"):

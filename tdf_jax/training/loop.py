@@ -56,6 +56,21 @@ class TrainConfig:
     save_seconds: float = 120.0
     network: NetworkConfig = NetworkConfig()
 
+    def __post_init__(self):
+        least = dict.fromkeys(("batch", "queries", "objects", "validation", "validate_every"), 1)
+        least |= {"seed": 0, "warmup": 0, "steps": self.warmup + 1, "points": self.network.neighbours + 1}
+        for name, low in least.items():
+            if getattr(self, name) < low:
+                raise InputError(f"TrainConfig(): {name} is {getattr(self, name)}; expected at least {low}")
+        if self.points > training_data.SPARSE_CLOUDS[1]:
+            raise InputError(f"TrainConfig(): points is {self.points}; expected at most {training_data.SPARSE_CLOUDS[1]}")
+        if not 0 < self.learning_rate < np.inf:
+            raise InputError(f"TrainConfig(): learning_rate is {self.learning_rate}; expected a positive number")
+        if not 0 <= self.sparse <= 1:
+            raise InputError(f"TrainConfig(): sparse is {self.sparse}; expected a share, 0 to 1")
+        if not self.save_seconds >= 0:
+            raise InputError(f"TrainConfig(): save_seconds is {self.save_seconds}; expected 0 or more")
+
 
 def train(config: TrainConfig, directory: str | Path, progress: bool = True) -> dict:
     """Train, or resume where the checkpoint in `directory` stands, to `config.steps`.
@@ -176,7 +191,7 @@ def _claim(config, directory):
     settings = dataclasses.asdict(config)
     path = directory / "config.json"
     if path.exists():
-        old = json.loads(path.read_text())
+        old = _read(path, lambda content: dict(json.loads(content)))
         changed = [name for name in settings if name != "steps" and old.get(name) != settings[name]]
         if changed:
             raise InputError(
@@ -195,9 +210,18 @@ def _restore(directory, params, state):
     path = directory / "state.msgpack"
     if not path.exists():
         return params, state, 0
-    saved = serialization.from_bytes({"params": params, "state": state, "step": 0}, path.read_bytes())
+    target = {"params": params, "state": state, "step": 0}
+    saved = _read(path, lambda content: serialization.from_bytes(target, content))
     saved = jax.tree.map(jnp.asarray, saved)
     return saved["params"], saved["state"], int(saved["step"])
+
+
+def _read(path, parse):
+    try:
+        return parse(path.read_bytes())
+    except Exception as error:  # damaged files raise whatever their parser stumbles on
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"train(): {path} cannot be read ({reason}); delete the folder, or restore the file") from None
 
 
 def _step_of(line):

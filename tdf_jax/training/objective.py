@@ -23,7 +23,8 @@ def sample_loss(
 
     Two linear read-outs of the latent (`params["frame"]`, used in training only) are asked to equal the object's canonical axes. A
     vector-neuron network has no bias, so it must find the frame in the cloud, and being equivariant it needs no
-    rotated copies for it. Without this term the latent takes hours instead of minutes to carry a frame at all.
+    rotated copies for it. Without this term, an early
+    trial could not match an object with itself after 500 steps; with it, the frame is found within 200.
 
     Args:
         params: {"network": ..., "frame": (latent, 2)}.
