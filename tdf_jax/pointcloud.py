@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 MINIMUM_POINTS = 21  # the encoder's 20 nearest neighbours, the point itself included, and one to choose from
 
-_MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb", ".off")
+MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb", ".off")
 _CLOUD_SUFFIXES = (".ply", ".npy", ".npz", ".xyz", ".pcd")
 
 
@@ -35,7 +35,7 @@ def load_mesh(path: str | Path, scale: float = 1.0) -> "trimesh.Trimesh":
     Raises:
         InputError: If the file is missing, unreadable, of another kind, without faces, or not finite.
     """
-    path = _existing_file("load_mesh", path, _MESH_SUFFIXES, scale)
+    path = _existing_file("load_mesh", path, MESH_SUFFIXES, scale)
     mesh = _mesh_in("load_mesh", path, _read_scene("load_mesh", path), scale)
     if mesh is None:
         raise InputError(f"load_mesh(): {path} has no faces; expected a surface. A cloud is read by load_points().")
@@ -61,11 +61,11 @@ def load_points(
     Raises:
         InputError: If the file is missing, unreadable or of another kind, or its points fail `check_points`.
     """
-    path = _existing_file("load_points", path, tuple(dict.fromkeys(_MESH_SUFFIXES + _CLOUD_SUFFIXES)), scale)
+    path = _existing_file("load_points", path, tuple(dict.fromkeys(MESH_SUFFIXES + _CLOUD_SUFFIXES)), scale)
     if count is not None and count < 1:
         raise InputError(f"load_points(): count is {count}; expected at least 1, or None for the default.")
     rng = np.random.default_rng(seed)
-    if path.suffix.lower() in _MESH_SUFFIXES:
+    if path.suffix.lower() in MESH_SUFFIXES:
         scene = _read_scene("load_points", path)
         mesh = _mesh_in("load_points", path, scene, scale)
         if mesh is not None:

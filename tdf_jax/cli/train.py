@@ -1,33 +1,67 @@
-"""`tdf train`: weights from generated objects."""
+"""`tdf train`: weights from labelled objects."""
 
+import dataclasses
+import os
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from tdf_jax.checkpoint import SUFFIX, save_model
+from tdf_jax.checkpoint import SUFFIX, load_model, save_model
 from tdf_jax.errors import InputError
 from tdf_jax.model import Model, ModelInfo
-from tdf_jax.training.loop import TrainConfig, train as run
+from tdf_jax.training.config import TrainConfig
+from tdf_jax.training.dataset import Recipe, build, load
+from tdf_jax.training.loop import steps_within, train as run
+from tdf_jax.training.record import metrics, settings_of
 
 
 def train(
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")],
+    data: Annotated[
+        Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="(default: generated mugs, in OUT/data)")
+    ] = None,
+    start_from: Annotated[
+        str | None, tyro.conf.arg(metavar="WEIGHTS", help_behavior_hint="(default: random weights)")
+    ] = None,
+    minutes: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: as --steps says)")] = None,
     weights: Annotated[
-        Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=f"(default: DIR/weights{SUFFIX})")
+        Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=f"(default: OUT/weights{SUFFIX})")
     ] = None,
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = TrainConfig(),
 ) -> None:
-    """Train a network on generated mugs, or go on where the run in a folder stands.
+    """Train a network on labelled objects, or go on where the run in a folder stands.
 
     Args:
-        out: folder of the run: its settings, metrics and checkpoint.
+        out: folder of the run: its settings, metrics, curves and checkpoint.
+        data: folder made by tdf dataset.
+        start_from: a name of shipped weights or a .safetensors file to go on from; --learning-rate 0.003 suits it.
+        minutes: choose --steps so that the run takes about so long on this machine.
         weights: .safetensors file to write at the end.
         config: settings of the run.
     """
+    from tdf_jax.viz.curves import training_figure
+    from tdf_jax.viz.plots import save_figure
+
     target = _target(out, weights)
-    params = run(config, out)
-    source = f"tdf train, {config.steps} steps, seed {config.seed}"
+    if minutes is not None and not 0 < minutes < float("inf"):
+        raise InputError(f"tdf train: --minutes is {minutes}; expected a positive number")
+    model = None if start_from is None else load_model(start_from)
+    if model is not None and model.config != config.network:
+        raise InputError(f"tdf train: --start-from {start_from} is a network of other sizes ({model.config}); expected {config.network}")
+    if data is None:
+        data = out / "data"
+        build(Recipe(seed=config.seed), data, os.cpu_count() or 1)
+    objects, validation = load(data)
+    before = settings_of(out)
+    if minutes is not None:
+        # A run that stands keeps its steps: they are what its learning rate follows.
+        steps = steps_within(minutes, config, objects) if before is None else before["steps"]
+        config = dataclasses.replace(config, steps=steps)
+    params = run(config, objects, validation, out, initial=None if model is None else model.params)
+    save_figure(out / "training.png", training_figure(metrics(out)))
+    origin = "" if start_from is None else f" from {start_from}"
+    source = f"tdf train, {config.steps} steps{origin}, seed {config.seed}"
     info = ModelInfo(name=target.stem, source=source, cloud_points=config.points)
     save_model(Model(params, config.network, info), target)
     print(f"saved {target}")

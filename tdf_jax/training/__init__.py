@@ -1,1 +1,1 @@
-"""Training the occupancy network: data (`data`), what is minimised (`objective`), the resumable loop (`loop`)."""
+"""Training the occupancy network: data (`objects`, `dataset`, `batch`), what is minimised (`objective`), the resumable run (`loop`, `record`)."""

@@ -1,0 +1,34 @@
+"""`tdf dataset`: labelled objects to train on, generated or from a folder of meshes."""
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from tdf_jax.errors import InputError
+from tdf_jax.training.dataset import Recipe, build, load
+
+
+def dataset(
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")],
+    workers: Annotated[int, tyro.conf.arg(help_behavior_hint="(default: one for every core)")] = 0,
+    recipe: Annotated[Recipe, tyro.conf.arg(name="")] = Recipe(),
+) -> None:
+    """Label generated mugs, or your own meshes, for `tdf train`; or go on where an interrupted call stood.
+
+    Args:
+        out: folder of the data set.
+        workers: processes.
+        recipe: what to build.
+    """
+    if workers < 0:
+        raise InputError(f"tdf dataset: --workers is {workers}; expected 1 or more, or 0 for one for every core")
+    build(recipe, out, workers or os.cpu_count() or 1)
+    parts = load(out)
+    for name, data in zip(("training", "validation"), parts):
+        box, near = data.inside[:, data.uniform].mean(), data.inside[:, data.uniform.stop :].mean()
+        seen = data.visible.mean()
+        print(f"{name}: {len(data.surface)} objects; inside: {box:.1%} of the uniform queries, {near:.1%} of those near the surface; "
+              f"a camera sees {seen:.0%} of a surface")
+    print(f"saved {out}")

@@ -1,0 +1,252 @@
+"""Data sets: many labelled objects in a folder of shards; building one is resumable and a function of its recipe."""
+
+import concurrent.futures
+import contextlib
+import dataclasses
+import hashlib
+import json
+import multiprocessing
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+from tqdm import tqdm
+
+from tdf_jax.errors import InputError
+from tdf_jax.files import replace_file
+from tdf_jax.pointcloud import MESH_SUFFIXES
+from tdf_jax.training.objects import UNIFORM_SHARE, Labelled, axis, canonical_mesh, generated_mug, scanned_object
+
+MANIFEST = "dataset.json"
+SHARD = 50  # objects in a file, 12 MB: what a kill can lose is less than half a minute's work
+SPLITS = ("training", "validation")
+VALIDATION_SEED = 1_000_003  # added to the recipe's seed; objects are a function of (seed, index)
+BITS = "inside", "visible"  # fields kept as single bits
+HELD_OUT = 10  # one mesh file in so many is kept for validation, at least one
+UNIT_SPREAD = 20.0  # largest diagonal over the smallest in a folder; more means that units are mixed
+
+
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+    """What a data set is made of; by default the shipped mug network's generated mugs.
+
+    Attributes:
+        seed: of every draw; disjoint seeds give disjoint generated objects.
+        objects: training objects. Of a folder of meshes, every mesh is used in turn, from the second time on stretched.
+        validation: validation objects, even. Of a folder, they are made from the tenth of the meshes that is held out.
+        points: surface points of an object.
+        queries: labelled query points of an object, half uniform in the padded bounding box, half near the surface.
+        cameras: around an object, from which partial clouds are seen.
+        meshes: folder of aligned meshes of one category; generated mugs if it is not given.
+        unit: metres per unit of the mesh files.
+        up: their axis that points up.
+        front: their axis towards what tells the object's side, such as a mug's handle.
+        stretch: repeated meshes are scaled along every axis by up to e to this, at random.
+    """
+
+    seed: int = 0
+    objects: int = 1200
+    validation: int = 24
+    points: int = 3000
+    queries: int = 12000
+    cameras: int = 16
+    meshes: str | None = None
+    unit: float = 1.0
+    up: str = "+z"
+    front: str = "+x"
+    stretch: float = 0.15
+
+    def __post_init__(self):
+        least = {"seed": 0, "objects": 1, "validation": 2, "points": 100, "queries": 100, "cameras": 4}
+        for name, low in least.items():
+            if getattr(self, name) < low:
+                raise InputError(f"Recipe(): {name} is {getattr(self, name)}; expected at least {low}")
+        if self.validation % 2:
+            raise InputError(f"Recipe(): validation is {self.validation}; expected an even number, objects come in pairs")
+        if not 0 < self.unit < np.inf:
+            raise InputError(f"Recipe(): unit is {self.unit}; expected metres per unit of the files, such as 0.001")
+        if not 0 <= self.stretch <= 1:
+            raise InputError(f"Recipe(): stretch is {self.stretch}; expected 0 to 1")
+        if axis(self.up) @ axis(self.front):
+            raise InputError(f"Recipe(): up is {self.up} and front is {self.front}; expected two axes at a right angle")
+
+
+@dataclasses.dataclass(frozen=True)
+class DataSet:
+    """Objects in their canonical frame (up +z, front or handle +x), scaled to unit diagonal; fields as in `Labelled`."""
+
+    surface: Float[np.ndarray, "objects points 3"]
+    queries: Float[np.ndarray, "objects queries 3"]
+    inside: Bool[np.ndarray, "objects queries"]
+    visible: Bool[np.ndarray, "objects cameras points"]
+    places: Float[np.ndarray, "objects places 4 4"]
+    diagonal: Float[np.ndarray, " objects"]
+
+    @property
+    def uniform(self) -> slice:
+        """The queries that are uniform in the padded box."""
+        return slice(0, int(self.queries.shape[1] * UNIFORM_SHARE))
+
+    def digest(self) -> str:
+        """A name for the contents, by which a resumed run knows its data again."""
+        return hashlib.sha256(self.surface.tobytes() + self.inside.tobytes()).hexdigest()[:16]
+
+
+def build(recipe: Recipe, directory: str | Path, workers: int = 1, progress: bool = True) -> None:
+    """Label the objects of a recipe into a folder, or go on where an interrupted call stood.
+
+    Args:
+        recipe: what to build.
+        directory: receives `dataset.json` and a .npz file for every `SHARD` objects.
+        workers: processes.
+        progress: show a progress bar.
+
+    Raises:
+        InputError: the recipe's meshes will not do, or the folder holds another data set or cannot be written.
+    """
+    directory = Path(directory)
+    splits = _mesh_files(recipe)
+    manifest = {"recipe": dataclasses.asdict(recipe), "files": {name: [file.name for file in files] for name, files in splits.items()}}
+    if not _claimed(directory, manifest):
+        _check_meshes(recipe, [file for files in splits.values() for file in files], progress)
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"tdf dataset: cannot make the folder {directory} ({error}); expected a writable place") from None
+        replace_file("tdf dataset", directory / MANIFEST, json.dumps(manifest, indent=1).encode())
+    missing = [shard for shard in _shards(recipe) if not (directory / shard[0]).exists()]
+    tasks = [(recipe, splits[split], split, index) for _, split, indices in missing for index in indices]
+    with _mapped(_label, tasks, workers) as rows:
+        rows = iter(tqdm(rows, desc="labelling objects", total=len(tasks), disable=not progress))
+        for name, _, indices in missing:
+            columns = zip(*(next(rows) for _ in indices), strict=True)
+            arrays = {field: np.stack(column) for field, column in zip(Labelled._fields, columns, strict=True)}
+            arrays |= {field: np.packbits(arrays[field], axis=-1) for field in BITS}
+            replace_file("tdf dataset", directory / name, lambda file, arrays=arrays: np.savez(file, **arrays))
+
+
+def load(directory: str | Path) -> tuple[DataSet, DataSet]:
+    """Read a data set: its training and its validation objects.
+
+    Args:
+        directory: from `build`.
+
+    Raises:
+        InputError: there is none, it is not finished, or a file of it is damaged.
+    """
+    directory = Path(directory)
+    if not (directory / MANIFEST).exists():
+        raise InputError(f"load(): {directory} has no {MANIFEST}; expected a folder made by tdf dataset")
+    recipe = Recipe(**_read(directory / MANIFEST, lambda file: json.load(file)["recipe"]))
+    parts = {split: [] for split in SPLITS}
+    for name, split, indices in _shards(recipe):
+        if not (directory / name).exists():
+            raise InputError(f"load(): {directory} has no {name}; the data set is not finished: run its tdf dataset command again")
+        parts[split].append(_read(directory / name, lambda file, count=len(indices): _unpacked(file, recipe, count)))
+    return tuple(DataSet(*(np.concatenate(column) for column in zip(*parts[split]))) for split in SPLITS)
+
+
+def _shards(recipe):
+    """(file name, split, indices) of every shard."""
+    for split, count in zip(SPLITS, (recipe.objects, recipe.validation)):
+        for start in range(0, count, SHARD):
+            yield f"{split}-{start // SHARD:04d}.npz", split, range(start, min(start + SHARD, count))
+
+
+def _unpacked(file, recipe, count):
+    with np.load(file, allow_pickle=False) as arrays:
+        arrays = dict(arrays)
+    for field, size in zip(BITS, (recipe.queries, recipe.points), strict=True):
+        arrays[field] = np.unpackbits(arrays[field], axis=-1, count=size).astype(bool)
+    labelled = Labelled(**arrays)
+    if any(len(array) != count for array in labelled):
+        raise ValueError(f"expected {count} objects")
+    return labelled
+
+
+def _read(path, parse):
+    try:
+        with path.open("rb") as file:
+            return parse(file)
+    except Exception as error:  # damaged files raise whatever their parser stumbles on
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(
+            f"load(): {path} cannot be read ({reason}); delete that file and run the tdf dataset command again: it makes only what is missing"
+        ) from None
+
+
+def _claimed(directory, manifest):
+    """Whether this data set was begun here before; another one is refused."""
+    if not (directory / MANIFEST).exists():
+        return False
+    old = _read(directory / MANIFEST, json.load)
+    changed = [name for name in manifest["recipe"] if old.get("recipe", {}).get(name) != manifest["recipe"][name]]
+    changed += ["files"] * (old.get("files") != manifest["files"])
+    if changed:
+        raise InputError(
+            f"tdf dataset: {directory} holds another data set ({', '.join(changed)} differ); expected the same. "
+            "Choose another folder, or delete this one."
+        )
+    return True
+
+
+def _mesh_files(recipe) -> dict[str, list[Path]]:
+    """The mesh files of each split; none for a generated family."""
+    if recipe.meshes is None:
+        return {split: [] for split in SPLITS}
+    folder = Path(recipe.meshes)
+    files = sorted(file for file in folder.glob("*") if file.suffix.lower() in MESH_SUFFIXES) if folder.is_dir() else []
+    if len(files) < 2:
+        raise InputError(
+            f"tdf dataset: {folder} holds {len(files)} mesh files; expected a folder of at least two "
+            f"({', '.join(MESH_SUFFIXES)}), aligned, of one category"
+        )
+    held_out = max(1, len(files) // HELD_OUT)
+    files = [files[index] for index in np.random.default_rng(recipe.seed).permutation(len(files))]
+    return {"training": files[held_out:], "validation": files[:held_out]}
+
+
+def _check_meshes(recipe, files, progress):
+    """Every mesh must load and enclose a volume, and all must be of about one size."""
+    if not files:
+        return
+    diagonals, problems = {}, []
+    for file in tqdm(files, desc="checking meshes", disable=not progress):
+        try:
+            diagonals[file.name] = float(np.linalg.norm(canonical_mesh(file, recipe.unit, recipe.up, recipe.front).extents))
+        except InputError as error:
+            problems.append(str(error))
+    if problems:
+        listed = "\n  ".join(problems)
+        raise InputError(f"tdf dataset: {len(problems)} of {len(files)} meshes will not do; mend them or take them out:\n  {listed}")
+    small, large = min(diagonals, key=diagonals.get), max(diagonals, key=diagonals.get)
+    if diagonals[large] > UNIT_SPREAD * diagonals[small]:
+        raise InputError(
+            f"tdf dataset: {small} measures {diagonals[small]:.3g} m across and {large} {diagonals[large]:.3g} m; expected one unit in all "
+            "files: rescale some"
+        )
+
+
+def _label(task) -> Labelled:
+    """One object; a function of the recipe, the split and the index alone."""
+    recipe, files, split, index = task
+    rng = np.random.default_rng([recipe.seed + (VALIDATION_SEED if split == "validation" else 0), index])
+    counts = recipe.points, recipe.queries, recipe.cameras
+    if not files:
+        return generated_mug(rng, *counts)
+    mesh = canonical_mesh(files[index % len(files)], recipe.unit, recipe.up, recipe.front)
+    return scanned_object(mesh, rng, *counts, stretch=recipe.stretch if index >= len(files) else 0.0)
+
+
+@contextlib.contextmanager
+def _mapped(function, tasks, workers):
+    """Results in the order of the tasks; processes are started afresh, for a forked copy of a threaded one may hang."""
+    if workers < 2 or len(tasks) < 2:
+        yield map(function, tasks)
+        return
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(workers, context) as pool:
+        try:
+            yield pool.map(function, tasks)
+        finally:
+            pool.shutdown(cancel_futures=True)  # without it, an interruption waits for everything that was asked for

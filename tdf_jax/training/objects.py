@@ -1,0 +1,142 @@
+"""One object as training sees it: surface points, labelled query points, what cameras see, and its places."""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+if TYPE_CHECKING:
+    import trimesh
+
+from tdf_jax import views
+from tdf_jax.errors import InputError
+from tdf_jax.pointcloud import load_mesh, sample_surface
+from tdf_jax.shapes import build_mug, sample_mug
+
+UNIFORM_SHARE = 0.5  # of the query points: uniform in the padded bounding box; the rest lie near the surface
+BOX_PADDING = 0.10  # of the diagonal, on every side
+# Half of the points near the surface lie within a wall's thickness of it (2 mm on a real mug), half further out.
+NEAR_SPREADS = (0.012, 0.05)  # standard deviations, of the diagonal
+MUG_PLACES = ("handle", "rim", "base")
+LEAST_INSIDE = 0.002  # of the uniform query points; a mug has 0.05 to 0.15, a bowl of thin steel 0.008
+MOST_UNDECIDED = 0.03  # of the uniform query points: neither in nor out of an open mesh; a mug whose handle is open at its ends has none
+
+
+class Labelled(NamedTuple):
+    """An object in its canonical frame (up +z, front or handle +x), scaled to unit diagonal.
+
+    Attributes:
+        surface: uniform by area.
+        queries: the first half uniform in the padded bounding box, the rest near the surface.
+        inside: which queries are.
+        visible: which surface points each of some cameras all around sees.
+        places: T_object_place of places that mean the same on every object.
+        diagonal: metres, of the object before it was scaled.
+    """
+
+    surface: Float[np.ndarray, "points 3"]
+    queries: Float[np.ndarray, "queries 3"]
+    inside: Bool[np.ndarray, " queries"]
+    visible: Bool[np.ndarray, "cameras points"]
+    places: Float[np.ndarray, "places 4 4"]
+    diagonal: Float[np.ndarray, ""]
+
+
+def generated_mug(rng: np.random.Generator, points: int, queries: int, cameras: int) -> Labelled:
+    """A mug of the library's own family with its places handle, rim and base."""
+    mug = build_mug(sample_mug(rng))
+    places = np.stack([mug.frames[name] for name in MUG_PLACES])
+    return _labelled(mug.mesh, mug.contains, places, rng, points, queries, cameras)
+
+
+def scanned_object(
+    mesh: "trimesh.Trimesh", rng: np.random.Generator, points: int, queries: int, cameras: int, stretch: float
+) -> Labelled:
+    """A user's mesh, watertight or not, labelled by the generalised winding number.
+
+    Its places are the middle of the bounding box and of its six faces, axes as the object's.
+
+    Args:
+        mesh: from `canonical_mesh`.
+        rng: source of chance.
+        points, queries, cameras: how many.
+        stretch: every axis is scaled by up to e to this, at random; 0 leaves the mesh as it is.
+    """
+    mesh = mesh.copy()
+    mesh.apply_scale(np.exp(rng.uniform(-stretch, stretch, 3)))
+    mesh.apply_translation(-mesh.bounds.mean(axis=0))
+    middles = np.concatenate([np.zeros((1, 3)), np.diag(mesh.extents / 2), -np.diag(mesh.extents / 2)])
+    places = np.tile(np.eye(4), (len(middles), 1, 1))
+    places[:, :3, 3] = middles
+    return _labelled(mesh, lambda x: np.abs(winding_number(mesh, x)) > 0.5, places, rng, points, queries, cameras)
+
+
+def _labelled(mesh, contains, places, rng, points, queries, cameras):
+    low, high = mesh.bounds
+    diagonal = float(np.linalg.norm(high - low))
+    uniform = int(queries * UNIFORM_SHARE)
+    pad = BOX_PADDING * diagonal
+    box = rng.uniform(low - pad, high + pad, (uniform, 3))
+    spreads = np.resize(NEAR_SPREADS, queries - uniform)[:, None] * diagonal
+    near = sample_surface(mesh, queries - uniform, rng) + rng.normal(size=(queries - uniform, 3)) * spreads
+    x = np.concatenate([box, near])
+    surface = sample_surface(mesh, points, rng)
+    visible = views.visible(mesh, surface, views.cameras(cameras, rng), rng)
+    places = places.copy()
+    places[:, :3, 3] /= diagonal
+    surface_unit, x_unit, places = ((array).astype(np.float32) for array in (surface / diagonal, x / diagonal, places))
+    return Labelled(surface_unit, x_unit, contains(x), visible, places, np.float32(diagonal))
+
+
+def canonical_mesh(path, unit: float, up: str, front: str) -> "trimesh.Trimesh":
+    """A mesh file in metres, up +z, front +x, checked to enclose a volume.
+
+    Args:
+        path: .obj, .stl, .ply, .off, .glb.
+        unit: metres per unit of the file.
+        up, front: axes of the file, such as "+z" and "-x".
+
+    Raises:
+        InputError: the file is no mesh, or encloses nothing, or has holes too large to tell inside from outside.
+    """
+    mesh = load_mesh(path, scale=unit)
+    z, x = axis(up), axis(front)
+    mesh.vertices = mesh.vertices @ np.stack([x, np.cross(z, x), z], axis=1)
+    mesh.apply_translation(-mesh.bounds.mean(axis=0))
+    pad = BOX_PADDING * np.linalg.norm(mesh.extents)
+    x = np.random.default_rng(0).uniform(mesh.bounds[0] - pad, mesh.bounds[1] + pad, (4000, 3))
+    winding = np.abs(winding_number(mesh, x))
+    undecided = np.mean((winding > 0.25) & (winding < 0.75))
+    if np.mean(winding > 0.5) < LEAST_INSIDE or undecided > MOST_UNDECIDED:
+        raise InputError(
+            f"canonical_mesh(): {path} encloses {np.mean(winding > 0.5):.1%} of its bounding box, {undecided:.1%} undecided; expected a "
+            "closed surface, or one with small holes, of a solid with walls: give it thickness, or leave it out"
+        )
+    return mesh
+
+
+def axis(name: str) -> Float[np.ndarray, "3"]:
+    """The unit vector of "+x", "-x", "+y", ...
+
+    Raises:
+        InputError: any other name.
+    """
+    if len(name) != 2 or name[0] not in "+-" or name[1] not in "xyz":
+        raise InputError(f"axis(): {name!r} is no axis; expected a sign and a letter, such as +z or -x")
+    return np.eye(3)["xyz".index(name[1])] * (1.0 if name[0] == "+" else -1.0)
+
+
+def winding_number(mesh: "trimesh.Trimesh", x: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points"]:
+    """The generalised winding number of points: 1 inside, 0 outside, in between where a surface is open.
+
+    Raises:
+        InputError: libigl is not installed.
+
+    Source:
+        Barill, Dickson, Schmidt, Levin, Jacobson, Fast winding numbers for soups and clouds, SIGGRAPH 2018.
+    """
+    try:
+        import igl
+    except ImportError:
+        raise InputError("winding_number(): libigl is not installed; try: pip install 'tdf_jax[mesh]'") from None
+    return igl.fast_winding_number(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64), np.asarray(x, float))

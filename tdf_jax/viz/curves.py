@@ -1,0 +1,46 @@
+"""Curves of a training run, in matplotlib and without its global state."""
+
+from collections.abc import Sequence
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from tdf_jax.viz.plots import INK, STYLE, TRUTH
+
+PANELS = (
+    ("bce", "occupancy: binary cross-entropy", "log"),
+    ("iou", "occupancy: IoU at 0.5", "linear"),
+    ("frame", "frame read out of the latent: squared error", "log"),
+    ("place", "places: -log share of the right pose", "linear"),
+)
+SMOOTH = 50  # steps averaged in the curves of training
+SETS = (("validation", "validation, complete clouds", TRUTH), ("one_view", "validation, one view", INK))
+
+
+def training_figure(rows: Sequence[dict]) -> Figure:
+    """Losses and IoU against the step, of training batches and of both validations.
+
+    Args:
+        rows: lines of metrics, as `tdf_jax.training.record.metrics` reads them.
+    """
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(7.2, 4.6), layout="constrained")
+        axes = figure.subplots(2, 2, sharex=True)
+        steps = np.array([row["step"] for row in rows])
+        width = min(SMOOTH, len(rows))
+        for panel, (name, label, scale) in zip(axes.flat, PANELS):
+            values = np.convolve([row[name] for row in rows], np.ones(width) / width, mode="valid")
+            panel.plot(steps[width - 1 :], values, color="#9aa5b1", lw=1, label=f"training, mean of {width} steps")
+            for key, shown, colour in SETS:
+                measured = [(row["step"], row[key][name]) for row in rows if key in row]
+                panel.plot(*np.array(measured).reshape(-1, 2).T, color=colour, marker="o", ms=2.5, lw=1, label=shown)
+            panel.set(title=label, yscale=scale)
+            if scale == "log":
+                panel.yaxis.set_major_formatter("{x:g}")
+                panel.yaxis.set_minor_formatter("")
+            panel.grid(color="#dddddd", lw=0.5)
+        axes[0, 0].legend(frameon=False)
+        for panel in axes[1]:
+            panel.set_xlabel("step")
+    return figure

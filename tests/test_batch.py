@@ -1,0 +1,123 @@
+"""Batches: pairs of objects, scaled and centred together with their queries and places, as sensors give them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tdf_jax.training import batch, dataset
+from tdf_jax.training.batch import DIAGONALS, PAIR_SPREAD, draw, validation_pairs
+from tdf_jax.training.dataset import Recipe
+
+SIZES = {"pairs": 3, "points": 200, "queries": 50, "box": 12, "poses": 6}
+
+
+@pytest.fixture(scope="module")
+def objects(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("objects")
+    dataset.build(Recipe(seed=5, objects=3, validation=2, points=1200, queries=1000, cameras=6), folder, progress=False)
+    return dataset.load(folder)[0]
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    monkeypatch.setattr(batch, "DENSE", 1000)
+    monkeypatch.setattr(batch, "SPARSE_CLOUDS", (250, 1000))
+
+
+def drawn(objects, seed, corruption=0.0, **changes):
+    return draw(objects, np.random.default_rng(seed), corruption=corruption, **(SIZES | changes))
+
+
+def pairs_of(batch_):
+    """Every (object, its partner) of a batch as dictionaries of their fields."""
+    fields = [field.name for field in dataclasses.fields(batch_)]
+    for pair in range(len(batch_.clouds)):
+        for which in range(2):
+            yield {name: getattr(batch_, name)[pair, which] for name in fields}, {name: getattr(batch_, name)[pair, 1 - which] for name in fields}
+
+
+def source(objects, sample):
+    """Which object a complete cloud is of, and its diagonal: by its extents."""
+    shapes = np.ptp(objects.surface, axis=1)
+    extents = np.ptp(sample["clouds"], axis=0)
+    ratios = extents / shapes
+    index = np.argmin(np.ptp(ratios, axis=1) / ratios.mean(axis=1))
+    return index, ratios[index].mean()
+
+
+def test_batches_are_a_function_of_the_generator(objects):
+    first, again, other = drawn(objects, 0, 0.5), drawn(objects, 0, 0.5), drawn(objects, 1, 0.5)
+    for field in dataclasses.fields(first):
+        np.testing.assert_array_equal(getattr(first, field.name), getattr(again, field.name))
+        assert getattr(first, field.name).dtype == np.float32
+    assert not np.array_equal(first.clouds, other.clouds)
+    shapes = [getattr(first, field.name).shape for field in dataclasses.fields(first)]
+    assert shapes == [(3, 2, 200, 3), (3, 2, 50, 3), (3, 2, 50), (3, 2, 3), (3, 2, 12, 3), (3, 2, 6, 12, 3)]
+
+
+def test_everything_of_an_object_is_scaled_and_centred_together(objects):
+    sizes = []
+    for sample, partner in pairs_of(drawn(objects, 0, pairs=6)):
+        index, size = source(objects, sample)
+        sizes.append((size, source(objects, partner)[1]))
+        np.testing.assert_allclose(sample["clouds"].mean(axis=0), 0, atol=1e-7)
+        place = (sample["queries"] - sample["centres"]) / size  # in the object's frame, at unit diagonal
+        nearest = np.linalg.norm(place[:, None] - objects.queries[index], axis=-1)
+        assert nearest.min(axis=1).max() < 0.01
+        assert np.mean(objects.inside[index][nearest.argmin(axis=1)] == sample["inside"]) > 0.95
+    sizes = np.array(sizes)
+    assert sizes.min() > 0.8 * DIAGONALS[0] and sizes.max() < 1.2 * DIAGONALS[1] and np.ptp(sizes) > 0.05
+    assert np.abs(np.log(sizes[:, 0] / sizes[:, 1])).max() < 2 * PAIR_SPREAD + 0.05  # a pair is of about one size
+
+
+def rigid(x, y):
+    """T with y = T x of point sets (points, 3), by Kabsch, and the largest distance left."""
+    a, b = x.mean(axis=0), y.mean(axis=0)
+    u, _, v = np.linalg.svd((y - b).T @ (x - a))
+    R = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, b - R @ a
+    return T, np.abs(x @ R.T + T[:3, 3] - y).max()
+
+
+def test_the_right_pose_is_the_same_place_of_the_partner_and_the_others_are_not(objects):
+    """Shown box and first offered box are rigid copies, related by place to place; places here are told apart by position."""
+    for sample, partner in pairs_of(drawn(objects, 2, pairs=8)):
+        (index, size), (other, other_size) = source(objects, sample), source(objects, partner)
+        T, left = rigid(sample["shown"], sample["offered"][0])
+        assert left < 1e-5
+        expected = []
+        for place, other_place in zip(objects.places[index].copy(), objects.places[other].copy()):
+            place[:3, 3] = place[:3, 3] * size + sample["centres"]
+            other_place[:3, 3] = other_place[:3, 3] * other_size + partner["centres"]
+            expected.append(other_place @ np.linalg.inv(place))
+        assert min(np.abs(T - motion).max() for motion in expected) < 0.01
+        for wrong in sample["offered"][1:]:
+            assert rigid(sample["shown"], wrong)[1] < 1e-5
+            moved = np.linalg.norm(wrong - sample["offered"][0], axis=-1).max()
+            assert moved > 0.003 * size
+
+
+def test_corrupted_clouds_are_partial_sparse_or_noisy(objects):
+    """The mean of a cloud seen from one side is off the object's; that of a complete one is not."""
+    off = {}
+    for corruption in (0.0, 1.0):
+        samples = [sample for sample, _ in pairs_of(drawn(objects, 4, corruption, pairs=30))]
+        spread = [np.linalg.norm(np.ptp(sample["clouds"], axis=0)) for sample in samples]
+        off[corruption] = np.array([np.linalg.norm(sample["centres"]) for sample in samples]) / spread
+    assert off[0.0].max() < 0.06
+    assert 0.1 < np.mean(off[1.0] > 0.07) < 0.6
+
+
+def test_validation_pairs_show_every_object_once_at_one_size(objects):
+    objects = dataclasses.replace(objects, **{f.name: getattr(objects, f.name)[:2] for f in dataclasses.fields(objects)})
+    full, view = (validation_pairs(objects, 100, 12, 6, one_view)[0] for one_view in (False, True))
+    assert full.queries.shape == (2, 500, 3)
+    np.testing.assert_array_equal(full.inside, objects.inside[:, :500])
+    extents = np.ptp(full.clouds, axis=1) / np.ptp(objects.surface, axis=1)
+    np.testing.assert_allclose(extents, batch.VALIDATION_DIAGONAL, rtol=0.08)
+    seen = [objects.surface[k][objects.visible[k, 0]] * batch.VALIDATION_DIAGONAL for k in range(2)]
+    for cloud, centre, points in zip(view.clouds, view.centres, seen):
+        distances = np.linalg.norm((cloud - centre)[:, None] - points, axis=-1)
+        assert distances.min(axis=1).max() < 1e-6

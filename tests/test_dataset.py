@@ -1,0 +1,285 @@
+"""Labelled objects, generated and scanned, and the data sets they make: deterministic, resumable, checked."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from tdf_jax.errors import InputError
+from tdf_jax.pointcloud import sample_surface
+from tdf_jax.shapes import build_mug, sample_mug
+from tdf_jax.training import dataset, objects
+from tdf_jax.training.dataset import Recipe, build, load
+from tdf_jax.training.objects import BOX_PADDING, MUG_PLACES, canonical_mesh, generated_mug, scanned_object
+
+RECIPE = Recipe(seed=5, objects=5, validation=2, points=200, queries=400, cameras=4)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr(dataset, "SHARD", 2)
+    monkeypatch.setattr("tdf_jax.views.OCCLUDERS", 2000)
+
+
+@pytest.fixture(scope="module")
+def mug():
+    return build_mug(sample_mug(np.random.default_rng([5, 0])))
+
+
+@pytest.fixture(scope="module")
+def labelled():
+    return generated_mug(np.random.default_rng([5, 0]), points=400, queries=1000, cameras=4)
+
+
+@pytest.fixture
+def meshes(tmp_path):
+    """Four mugs as a user may have them: millimetres, y up, the handle towards -z, one of them open."""
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    turn = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])  # canonical axes to the file's
+    for index in range(4):
+        mesh = build_mug(sample_mug(np.random.default_rng([6, index]))).mesh
+        mesh = trimesh.Trimesh(1000 * mesh.vertices @ turn.T + 7.0, mesh.faces[: -3 if index == 0 else None], process=False)
+        mesh.export(folder / f"mug{index}.obj")
+    (folder / "notes.txt").write_text("not a mesh")
+    return folder
+
+
+def scanned_recipe(folder, **changes):
+    return dataclasses.replace(RECIPE, meshes=str(folder), unit=0.001, up="+y", front="-z", **changes)
+
+
+def quiet_build(recipe, folder, **options):
+    build(recipe, folder, progress=False, **options)
+
+
+# ---- one object ----
+
+
+def winding_numbers(mesh, points):
+    """How often a closed mesh winds around each point, 1 inside, 0 outside, by Van Oosterom's solid angles."""
+    corners = mesh.vertices[mesh.faces][None] - points[:, None, None]
+    a, b, c = np.moveaxis(corners, 2, 0)
+    A, B, C = (np.linalg.norm(corner, axis=-1) for corner in (a, b, c))
+    volume = np.einsum("pfi,pfi->pf", a, np.cross(b, c))
+    spread = A * B * C + (a * b).sum(-1) * C + (b * c).sum(-1) * A + (c * a).sum(-1) * B
+    return 2 * np.arctan2(volume, spread).sum(axis=1) / (4 * np.pi)
+
+
+def test_labels_and_surfaces_are_those_of_the_mesh(mug, labelled):
+    diagonal = labelled.diagonal
+    np.testing.assert_allclose(diagonal, np.linalg.norm(mug.mesh.extents), rtol=1e-6)
+    chosen = np.r_[:120, 500:620]  # uniform ones, and some near the surface
+    inside, x = labelled.inside[chosen], labelled.queries[chosen] * diagonal
+    assert 20 < inside.sum() < len(inside) - 20
+    np.testing.assert_array_equal(np.round(winding_numbers(mug.mesh, x)), inside)
+    dense = cKDTree(sample_surface(mug.mesh, 50_000, np.random.default_rng(0)))
+    assert dense.query(labelled.surface * diagonal)[0].max() < 0.01 * diagonal
+    assert labelled.visible.shape == (4, 400) and 0.05 < labelled.visible.mean() < 0.6
+
+
+def test_the_first_half_of_the_queries_is_uniform_in_the_padded_box(mug, labelled):
+    low, high = mug.mesh.bounds / labelled.diagonal
+    relative = (labelled.queries[:500] - low + BOX_PADDING) / (high - low + 2 * BOX_PADDING)
+    assert (relative > -1e-5).all() and (relative < 1 + 1e-5).all()
+    np.testing.assert_allclose(relative.mean(axis=0), 0.5, atol=0.06)  # 4.6 standard deviations of the mean
+    np.testing.assert_allclose(relative.std(axis=0), np.sqrt(1 / 12), atol=0.03)
+
+
+def test_places_are_the_mugs_frames_at_unit_diagonal(mug, labelled):
+    assert MUG_PLACES[0] == "handle"
+    for place, name in zip(labelled.places, MUG_PLACES, strict=True):
+        expected = mug.frames[name].copy()
+        expected[:3, 3] /= labelled.diagonal
+        np.testing.assert_allclose(place, expected, atol=1e-6)
+
+
+def test_a_scanned_mesh_is_labelled_as_the_exact_solid_is(meshes):
+    """The open mug is among them: its winding number still tells inside from outside."""
+    pytest.importorskip("igl")
+    for index in range(2):
+        mesh = canonical_mesh(meshes / f"mug{index}.obj", 0.001, "+y", "-z")
+        assert mesh.is_watertight == (index == 1)
+        mug = build_mug(sample_mug(np.random.default_rng([6, index])))
+        middle = mug.mesh.bounds.mean(axis=0)
+        found = scanned_object(mesh, np.random.default_rng(0), 300, 2000, 4, stretch=0.0)
+        x = found.queries * found.diagonal
+        assert np.mean(mug.contains(x + middle) == found.inside) > 0.998
+        np.testing.assert_allclose(found.diagonal, np.linalg.norm(mug.mesh.extents), rtol=1e-5)
+
+
+def test_places_of_a_scanned_mesh_are_its_box_and_stretch_with_it(meshes):
+    pytest.importorskip("igl")
+    mesh = canonical_mesh(meshes / "mug1.obj", 0.001, "+y", "-z")
+    plain, stretched = (scanned_object(mesh, np.random.default_rng(3), 4000, 400, 4, stretch=stretch) for stretch in (0.0, 0.3))
+    for found in (plain, stretched):
+        assert found.places.shape == (7, 4, 4)
+        np.testing.assert_allclose(found.places[:, :3, 3].max(axis=0), found.surface.max(axis=0), atol=0.01)
+        np.testing.assert_allclose(found.places[:, :3, 3].min(axis=0), found.surface.min(axis=0), atol=0.01)
+    shapes = [np.ptp(found.surface, axis=0) for found in (plain, stretched)]
+    assert np.abs(shapes[0] - shapes[1]).max() > 0.02
+
+
+@pytest.mark.parametrize(
+    ("mesh", "message"),
+    [
+        (trimesh.creation.box(extents=(1, 1, 1e-4)), "encloses 0.0% of its bounding box"),
+        (trimesh.Trimesh(trimesh.creation.box().vertices, trimesh.creation.box().faces[:6]), r"encloses \d+\.\d% of its bounding box, [1-9]\d?\.\d% undecided"),
+    ],
+)
+def test_meshes_without_volume_are_refused(mesh, message, tmp_path):
+    pytest.importorskip("igl")
+    mesh.export(tmp_path / "sheet.obj")
+    with pytest.raises(InputError, match=rf"sheet\.obj {message}.*; expected a closed surface"):
+        canonical_mesh(tmp_path / "sheet.obj", 1.0, "+z", "+x")
+
+
+# ---- data sets ----
+
+
+def same(a, b):
+    for field in dataclasses.fields(a):
+        np.testing.assert_array_equal(getattr(a, field.name), getattr(b, field.name))
+
+
+def test_a_data_set_is_its_objects(tmp_path):
+    quiet_build(RECIPE, tmp_path / "data")
+    training, validation = load(tmp_path / "data")
+    assert (len(training.surface), len(validation.surface)) == (5, 2)
+    for index in (0, 4):
+        expected = generated_mug(np.random.default_rng([5, index]), 200, 400, 4)
+        for name, array in expected._asdict().items():
+            np.testing.assert_array_equal(getattr(training, name)[index], array)
+    assert training.uniform == slice(0, 200)
+    assert not np.isin(validation.diagonal, training.diagonal).any()
+    assert training.digest() != validation.digest()
+    names = {path.name for path in (tmp_path / "data").iterdir()}
+    assert names == {"dataset.json", *(f"training-000{k}.npz" for k in range(3)), "validation-0000.npz"}
+
+
+def test_an_interrupted_build_goes_on_to_the_same_data_set(tmp_path, monkeypatch):
+    quiet_build(RECIPE, tmp_path / "whole")
+    label, count = dataset._label, iter(range(100))
+
+    def killed_at_4(task):
+        if next(count) == 4:
+            raise KeyboardInterrupt
+        return label(task)
+
+    monkeypatch.setattr(dataset, "_label", killed_at_4)
+    with pytest.raises(KeyboardInterrupt):
+        quiet_build(RECIPE, tmp_path / "cut")
+    assert sorted(path.name for path in (tmp_path / "cut").iterdir()) == ["dataset.json", "training-0000.npz", "training-0001.npz"]
+    with pytest.raises(InputError, match=r"no training-0002.npz; the data set is not finished: run its tdf dataset"):
+        load(tmp_path / "cut")
+    before = (tmp_path / "cut" / "training-0000.npz").stat().st_mtime_ns
+    monkeypatch.setattr(dataset, "_label", label)
+    quiet_build(RECIPE, tmp_path / "cut")
+    assert (tmp_path / "cut" / "training-0000.npz").stat().st_mtime_ns == before
+    for a, b in zip(load(tmp_path / "whole"), load(tmp_path / "cut")):
+        same(a, b)
+
+
+def test_a_folder_of_meshes_is_split_and_repeated_stretched(meshes, tmp_path):
+    pytest.importorskip("igl")
+    quiet_build(scanned_recipe(meshes), tmp_path / "data")
+    training, validation = load(tmp_path / "data")
+    files = json.loads((tmp_path / "data" / "dataset.json").read_text())["files"]
+    assert len(files["training"]) == 3 and len(files["validation"]) == 1
+    assert sorted(files["training"] + files["validation"]) == [f"mug{k}.obj" for k in range(4)]
+    extents = np.ptp(training.surface, axis=1)
+    # Five objects of three meshes: the fourth is the first mesh once more, stretched.
+    assert 0.005 < np.abs(extents[3] - extents[0]).max() < 0.3
+    assert extents[:, 0].min() > 0.4  # the handle's side
+    (meshes / "mug9.obj").write_bytes((meshes / "mug1.obj").read_bytes())
+    with pytest.raises(InputError, match=r"holds another data set \(files differ\)"):
+        quiet_build(scanned_recipe(meshes), tmp_path / "data")
+
+
+def test_processes_give_the_same(tmp_path):
+    """Started afresh, they see nothing of this test's patches, so with the shipped number of occluders."""
+    recipe = dataclasses.replace(RECIPE, objects=2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tdf_jax.views.OCCLUDERS", 100_000)
+        quiet_build(recipe, tmp_path / "one")
+    quiet_build(recipe, tmp_path / "two", workers=2)
+    for a, b in zip(load(tmp_path / "one"), load(tmp_path / "two")):
+        same(a, b)
+
+
+# ---- bad input ----
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"objects": 0}, "objects is 0; expected at least 1"),
+        ({"validation": 3}, "validation is 3; expected an even number"),
+        ({"seed": -1}, "seed is -1"),
+        ({"unit": 0.0}, "unit is 0.0; expected metres per unit"),
+        ({"up": "z"}, "'z' is no axis; expected a sign and a letter"),
+        ({"up": "+x", "front": "-x"}, r"up is \+x and front is -x; expected two axes at a right angle"),
+        ({"stretch": 2.0}, "stretch is 2.0"),
+    ],
+)
+def test_bad_recipes(changes, message):
+    with pytest.raises(InputError, match=message):
+        dataclasses.replace(RECIPE, **changes)
+
+
+def test_empty_folders_bad_meshes_and_mixed_units_are_refused_before_any_work(meshes, tmp_path):
+    pytest.importorskip("igl")
+    (tmp_path / "empty").mkdir()
+    for folder in (tmp_path / "empty", tmp_path / "missing"):
+        with pytest.raises(InputError, match=r"holds 0 mesh files; expected a folder of at least two"):
+            quiet_build(scanned_recipe(folder), tmp_path / "data")
+    trimesh.creation.box(extents=(1, 1, 1e-4)).export(meshes / "sheet.obj")
+    (meshes / "torn.stl").write_bytes(b"solid")
+    with pytest.raises(InputError, match=r"2 of 6 meshes will not do; mend them or take them out:\n.*(\n.*)"):
+        quiet_build(scanned_recipe(meshes), tmp_path / "data")
+    for name in ("sheet.obj", "torn.stl"):
+        (meshes / name).unlink()
+    trimesh.load_mesh(meshes / "mug1.obj").apply_scale(0.001).export(meshes / "metres.obj")
+    with pytest.raises(InputError, match=r"metres\.obj measures 0\.000.* one unit in all files"):
+        quiet_build(scanned_recipe(meshes), tmp_path / "data")
+    assert not (tmp_path / "data").exists()
+
+
+def test_other_recipes_and_damaged_files_are_refused(tmp_path):
+    quiet_build(RECIPE, tmp_path / "data")
+    with pytest.raises(InputError, match=r"holds another data set \(seed, points differ\)"):
+        quiet_build(dataclasses.replace(RECIPE, seed=6, points=300), tmp_path / "data")
+    shard = tmp_path / "data" / "training-0001.npz"
+    shard.write_bytes(shard.read_bytes()[:1000])
+    with pytest.raises(InputError, match=r"training-0001.npz cannot be read .*delete that file and run the tdf dataset command again"):
+        load(tmp_path / "data")
+    shard.unlink()
+    quiet_build(RECIPE, tmp_path / "data")
+    load(tmp_path / "data")
+    (tmp_path / "data" / "dataset.json").write_text("{")
+    with pytest.raises(InputError, match=r"dataset.json cannot be read"):
+        load(tmp_path / "data")
+    with pytest.raises(InputError, match=r"has no dataset.json; expected a folder made by tdf dataset"):
+        load(tmp_path)
+
+
+def test_a_full_disk_loses_nothing(tmp_path, monkeypatch):
+    import errno
+
+    savez, count = np.savez, iter(range(100))
+
+    def full(file, **arrays):
+        if next(count) == 1:
+            file.write(b"half")
+            raise OSError(errno.ENOSPC, "No space left on device")
+        savez(file, **arrays)
+
+    monkeypatch.setattr(dataset.np, "savez", full)
+    with pytest.raises(InputError, match=r"cannot write .*training-0001.npz .*No space left"):
+        quiet_build(RECIPE, tmp_path / "data")
+    assert sorted(path.name for path in (tmp_path / "data").iterdir()) == ["dataset.json", "training-0000.npz"]
+    quiet_build(RECIPE, tmp_path / "data")
+    assert len(load(tmp_path / "data")[0].surface) == 5

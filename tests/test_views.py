@@ -1,0 +1,60 @@
+"""What cameras see, against marching along the rays through exact solids."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from tdf_jax import views
+from tdf_jax.pointcloud import sample_surface
+from tdf_jax.shapes import build_mug, sample_mug
+
+
+def truly_visible(mug, points, direction):
+    """No clay between a point and the camera, at steps finer than any wall."""
+    middle, diagonal = mug.mesh.bounds.mean(axis=0), np.linalg.norm(mug.mesh.extents)
+    towards = middle + views.DISTANCE * diagonal * direction - points
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    hidden = np.zeros(len(points), bool)
+    for step in np.concatenate([np.linspace(0.0007, 0.02, 20), np.linspace(0.02, 1.3 * diagonal, 120)]):
+        hidden |= mug.contains(points + step * towards)
+    return ~hidden
+
+
+@pytest.mark.parametrize("index", range(2))
+def test_a_mug_seen_from_outside(index):
+    rng = np.random.default_rng([8, index])
+    mug = build_mug(sample_mug(rng))
+    points = sample_surface(mug.mesh, 1500, rng)
+    directions = views.cameras(6, rng)
+    seen = views.visible(mug.mesh, points, directions, rng)
+    assert seen.shape == (6, 1500) and seen.dtype == bool
+    truth = np.stack([truly_visible(mug, points, direction) for direction in directions[:3]])
+    # Of what is said to be seen nearly all is; grazing surfaces are lost, as a depth camera loses them.
+    assert np.sum(seen[:3] & truth) > 0.85 * np.sum(seen[:3])
+    assert np.sum(seen[:3] & truth) > 0.6 * np.sum(truth)
+
+
+def test_a_ball_hides_its_far_half():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.1)
+    points = ball.vertices + [0.3, -0.2, 0.5]
+    ball.apply_translation([0.3, -0.2, 0.5])
+    directions = views.cameras(8, np.random.default_rng(0))
+    seen = views.visible(ball, points, directions, np.random.default_rng(1))
+    # The horizon is where the cosine is radius / distance.
+    horizon = 0.1 / (views.DISTANCE * np.linalg.norm(ball.extents))
+    for row, direction in zip(seen, directions):
+        cosine = (points - ball.centroid) @ direction / 0.1
+        assert row[cosine < horizon - 0.2].mean() < 0.01  # pixels that the silhouette just touches
+        assert row[cosine > 0.6].all()
+
+
+def test_cameras_are_all_around_and_turned_by_chance():
+    first, again, other = (views.cameras(16, np.random.default_rng(seed)) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).max() > 0.1
+    np.testing.assert_allclose(np.linalg.norm(first, axis=1), 1, atol=1e-12)
+    nearest = np.sort(first @ first.T, axis=1)[:, -2]
+    assert nearest.max() < np.cos(np.radians(20))  # none on top of another
+    rng = np.random.default_rng(2).normal(size=(500, 3))
+    covered = (rng / np.linalg.norm(rng, axis=1, keepdims=True) @ first.T).max(axis=1)
+    assert covered.min() > np.cos(np.radians(45))  # no direction far from all
