@@ -101,7 +101,9 @@ class Result:
             InputError: no start stayed finite.
         """
         if not self.finite.any():
-            raise InputError(f"Result.best: {self.status}; lower rotation_rate and translation_rate, or check the weights and the query points")
+            raise InputError(
+                f"Result.best: {self.status}; lower rotation_rate and translation_rate, or check the weights and the query points"
+            )
         return int(np.argmin(np.where(self.finite, self.energies, np.inf)))
 
     @property

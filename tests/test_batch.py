@@ -34,7 +34,7 @@ def pairs_of(batch_):
     fields = [field.name for field in dataclasses.fields(batch_)]
     for pair in range(len(batch_.clouds)):
         for which in range(2):
-            yield {name: getattr(batch_, name)[pair, which] for name in fields}, {name: getattr(batch_, name)[pair, 1 - which] for name in fields}
+            yield tuple({name: getattr(batch_, name)[pair, side] for name in fields} for side in (which, 1 - which))
 
 
 def source(objects, sample):

@@ -1,1 +1,1 @@
-"""Training the occupancy network: data (`objects`, `dataset`, `batch`), what is minimised (`objective`), the resumable run (`loop`, `record`)."""
+"""Training the network: data (`objects`, `dataset`, `batch`), what is minimised (`objective`), the run (`loop`, `record`)."""

@@ -25,7 +25,7 @@ NOISY_SHARE = 0.3  # of the clouds: normal noise with a standard deviation of up
 NOISE = 0.015
 
 # Boxes of query points, shown at a place of one object of a pair and offered to the other at the same place and at wrong poses.
-FIRST_SHARE = 0.6  # of the boxes at the first place of an object, a mug's handle; the others at any
+FIRST_SHARE = 0.6  # of the boxes at the first place of an object, a mug's handle; the others share the rest
 BOX_SIDES = (0.25, 0.55)  # of the pair's diagonal
 REMOTE_SHARE = 0.35  # of the boxes: not at the place itself but carried along with it
 REMOTE_DISTANCES = (0.1, 1.5)  # of the pair's diagonal, log-uniform
@@ -143,7 +143,7 @@ def _pair(rng, samples, diagonal, box, poses):
     """The fields of `Batch`: two samples, and query points shown at a place of each and offered to the other."""
     shown, offered = [], []
     for a, b in (samples, samples[::-1]):
-        place = 0 if rng.uniform() < FIRST_SHARE else rng.integers(len(a.places))
+        place = 0 if rng.uniform() < FIRST_SHARE else rng.integers(1, len(a.places))
         x = rng.uniform(-0.5, 0.5, (box, 3)) * rng.uniform(*BOX_SIDES) * diagonal
         T_place_query = np.eye(4)
         T_place_query[:3, :3] = Rotation.random(random_state=rng).as_matrix()

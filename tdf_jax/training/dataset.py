@@ -171,7 +171,8 @@ def _read(path, parse):
     except Exception as error:  # damaged files raise whatever their parser stumbles on
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(
-            f"load(): {path} cannot be read ({reason}); delete that file and run the tdf dataset command again: it makes only what is missing"
+            f"load(): {path} cannot be read ({reason}); delete that file and run the tdf dataset command again: "
+            "it makes only what is missing"
         ) from None
 
 

@@ -108,7 +108,9 @@ def steps_within(minutes: float, config: TrainConfig, data: DataSet) -> int:
     seconds = float(np.median(times[1:]))  # the first compiles
     steps = int(0.9 * 60 * minutes / seconds)
     if steps <= config.warmup:
-        raise InputError(f"train(): {minutes} minutes are enough for {steps} steps of {seconds:.2f} s; expected time for more than {config.warmup}")
+        raise InputError(
+            f"train(): {minutes} minutes are enough for {steps} steps of {seconds:.2f} s; expected time for more than {config.warmup}"
+        )
     return steps
 
 
