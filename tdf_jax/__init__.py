@@ -14,10 +14,11 @@ from tdf_jax.energy import (
 from tdf_jax.errors import InputError
 from tdf_jax.field import DescriptorField
 from tdf_jax.imitation import imitate, imitate_batch
+from tdf_jax.meshes import load_mesh, sample_surface
 from tdf_jax.model import Model, ModelInfo, encode
 from tdf_jax.network import NetworkConfig
 from tdf_jax.optimize import OptimizeConfig, Result, optimize
-from tdf_jax.pointcloud import load_mesh, load_points, sample_surface, thin
+from tdf_jax.pointcloud import load_points, thin
 from tdf_jax.query import box_query, gaussian_query, gripper_query, lattice_query
 from tdf_jax.shapes import MugParameters, build_mug, sample_mug
 from tdf_jax.trajectory import (

@@ -1,45 +1,18 @@
-"""Point clouds on the host: read meshes and clouds, check, sample, thin, cut to what a camera sees.
-
-Points are numpy arrays (points, 3) in metres. Meshes are read with trimesh, imported only when one is.
-"""
+"""Point clouds on the host: read, check, thin. Points are numpy arrays (points, 3) in metres."""
 
 import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 from jaxtyping import Float, Int
 
 from tdf_jax.errors import InputError
-
-if TYPE_CHECKING:
-    import trimesh
+from tdf_jax.meshes import MESH_SUFFIXES, existing_file, mesh_in, read_scene, sample_surface, unreadable
 
 MINIMUM_POINTS = 21  # the encoder's 20 nearest neighbours, the point itself included, and one to choose from
 
-MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb", ".off")
 _CLOUD_SUFFIXES = (".ply", ".npy", ".npz", ".xyz", ".pcd")
-
-
-def load_mesh(path: str | Path, scale: float = 1.0) -> "trimesh.Trimesh":
-    """Read a mesh; the parts of a scene are joined into one, vertices at the same place are merged.
-
-    Args:
-        path: An .obj, .stl, .ply, .glb or .off file.
-        scale: Metres per unit of the file: 0.01 for centimetres.
-
-    Returns:
-        The mesh, metres.
-
-    Raises:
-        InputError: If the file is missing, unreadable, of another kind, without faces, or not finite.
-    """
-    path = _existing_file("load_mesh", path, MESH_SUFFIXES, scale)
-    mesh = _mesh_in("load_mesh", path, _read_scene("load_mesh", path), scale)
-    if mesh is None:
-        raise InputError(f"load_mesh(): {path} has no faces; expected a surface. A cloud is read by load_points().")
-    return mesh
 
 
 def load_points(
@@ -61,13 +34,13 @@ def load_points(
     Raises:
         InputError: If the file is missing, unreadable or of another kind, or its points fail `check_points`.
     """
-    path = _existing_file("load_points", path, tuple(dict.fromkeys(MESH_SUFFIXES + _CLOUD_SUFFIXES)), scale)
+    path = existing_file("load_points", path, tuple(dict.fromkeys(MESH_SUFFIXES + _CLOUD_SUFFIXES)), scale)
     if count is not None and count < 1:
         raise InputError(f"load_points(): count is {count}; expected at least 1, or None for the default.")
     rng = np.random.default_rng(seed)
     if path.suffix.lower() in MESH_SUFFIXES:
-        scene = _read_scene("load_points", path)
-        mesh = _mesh_in("load_points", path, scene, scale)
+        scene = read_scene("load_points", path)
+        mesh = mesh_in("load_points", path, scene, scale)
         if mesh is not None:
             points = sample_surface(mesh, 1500 if count is None else count, rng)
             return check_points(points.astype(np.float32), str(path))
@@ -131,37 +104,6 @@ def check_points(points, name: str = "points"):
     return points
 
 
-def sample_surface(
-    mesh: "trimesh.Trimesh", count: int, rng: np.random.Generator | int
-) -> Float[np.ndarray, "points 3"]:
-    """Points drawn uniformly by area from the surface of a mesh.
-
-    Args:
-        mesh: The mesh.
-        count: How many, at least 1.
-        rng: Random generator, or a seed.
-
-    Returns:
-        Points, in the unit of the mesh, float64.
-
-    Raises:
-        InputError: If count is below 1 or the mesh has no area.
-    """
-    if count < 1:
-        raise InputError(f"sample_surface(): count is {count}; expected at least 1.")
-    rng = np.random.default_rng(rng)
-    corner, second, third = np.moveaxis(np.asarray(mesh.vertices)[np.asarray(mesh.faces)], 1, 0)
-    u, v = second - corner, third - corner
-    cumulative = np.cumsum(np.linalg.norm(np.cross(u, v), axis=1))
-    if len(cumulative) == 0 or not cumulative[-1] > 0:
-        raise InputError(f"sample_surface(): the mesh of {len(cumulative)} faces has no area; expected a surface.")
-    face = np.searchsorted(cumulative, rng.random(count) * cumulative[-1])
-    a, b = rng.random((2, count, 1))
-    outside = a + b > 1  # the other half of the parallelogram, folded back onto the triangle
-    a, b = np.where(outside, 1 - a, a), np.where(outside, 1 - b, b)
-    return corner[face] + a * u[face] + b * v[face]
-
-
 def thin(points: Float[np.ndarray, "points 3"], count: int) -> Float[np.ndarray, "thinned 3"]:
     """Evenly spread subset of a cloud by farthest-point thinning; arguments and errors as `thin_indices`."""
     indices = thin_indices(points, count)
@@ -204,108 +146,12 @@ def thin_indices(points: Float[np.ndarray, "points 3"], count: int) -> Int[np.nd
     return indices
 
 
-def single_view(
-    points: Float[np.ndarray, "points 3"], camera: Float[np.ndarray, "3"], reach: float = 100.0
-) -> Float[np.ndarray, "visible 3"]:
-    """The points a camera sees: hidden point removal by spherical flipping.
-
-    Points are mirrored outwards through a large sphere around the camera; those on the convex hull of the mirrored
-    points and the camera are visible. With the default reach, on 1500 points of a real mug seen from 0.6 m, 81-92 %
-    of the points returned are truly visible, and 81-96 % of those visible are returned.
-
-    Args:
-        points: Points of an object, metres.
-        camera: Position of the camera, metres, the same frame.
-        reach: Radius of the sphere over the distance of the farthest point, above 1. Larger returns more points:
-            a small one misses surfaces at grazing angles, a large one sees through sparse surfaces.
-
-    Returns:
-        The points seen, in their order.
-
-    Raises:
-        InputError: If the shapes are wrong, the camera is at a point, or points and camera lie in one plane.
-
-    Source:
-        Katz, Tal and Basri, Direct visibility of point sets, SIGGRAPH 2007.
-    """
-    return merge_views(points, np.asarray(camera)[None], reach)
-
-
-def merge_views(
-    points: Float[np.ndarray, "points 3"], cameras: Float[np.ndarray, "cameras 3"], reach: float = 100.0
-) -> Float[np.ndarray, "visible 3"]:
-    """The points that at least one of several cameras sees, in their order; see `single_view`."""
-    points, cameras = np.asarray(points), np.asarray(cameras)
-    if points.ndim != 2 or points.shape[1] != 3 or cameras.ndim != 2 or cameras.shape[1] != 3 or len(cameras) == 0:
-        raise InputError(
-            f"merge_views(): points have shape {points.shape} and cameras {cameras.shape}; "
-            "expected (points, 3) and (cameras, 3) with at least one camera."
-        )
-    if not reach > 1:
-        raise InputError(f"merge_views(): reach is {reach}; expected more than 1.")
-    return points[np.unique(np.concatenate([_visible(points, camera, reach) for camera in cameras]))]
-
-
-def _visible(points: np.ndarray, camera: np.ndarray, reach: float) -> np.ndarray:
-    from scipy.spatial import ConvexHull, QhullError
-
-    from_camera = points.astype(np.float64) - camera
-    distance = np.linalg.norm(from_camera, axis=1, keepdims=True)
-    if not distance.all():
-        raise InputError(f"merge_views(): the camera {camera.tolist()} is at one of the points; move it away.")
-    flipped = from_camera * (2 * reach * distance.max(initial=0) / distance - 1)
-    try:
-        hull = ConvexHull(np.concatenate([flipped, np.zeros((1, 3))]))
-    except (QhullError, ValueError) as error:
-        raise InputError(
-            f"merge_views(): the {len(points)} points and the camera {camera.tolist()} lie in one plane or are not "
-            "finite; expected at least 3 finite points and a camera outside their plane."
-        ) from error
-    return hull.vertices[hull.vertices < len(points)]
-
-
-def _existing_file(function: str, path: str | Path, suffixes: tuple[str, ...], scale: float) -> Path:
-    path = Path(path)
-    if path.suffix.lower() not in suffixes:
-        raise InputError(f"{function}(): {path} has suffix {path.suffix!r}; expected one of {', '.join(suffixes)}.")
-    if not path.is_file():
-        raise InputError(f"{function}(): there is no file {path}; check the path.")
-    if not (np.isfinite(scale) and scale > 0):
-        raise InputError(f"{function}(): scale is {scale}; expected metres per unit of the file, above 0.")
-    return path
-
-
-def _unreadable(function: str, path: Path, error: Exception) -> InputError:
-    reason = str(error) or type(error).__name__
-    return InputError(f"{function}(): {path} cannot be read as {path.suffix.lower()}: {reason}. Save it again.")
-
-
-def _read_scene(function: str, path: Path) -> "trimesh.Scene":
-    import trimesh
-
-    try:
-        # Unprocessed: processing would silently drop vertices that are not finite.
-        return trimesh.load_scene(str(path), process=False)
-    except Exception as error:  # damaged files raise whatever the parser stumbles on, struct.error to IndexError
-        raise _unreadable(function, path, error) from error
-
-
-def _mesh_in(function: str, path: Path, scene: "trimesh.Scene", scale: float) -> "trimesh.Trimesh | None":
-    if not any(len(getattr(part, "faces", ())) for part in scene.geometry.values()):
-        return None
-    mesh = scene.to_mesh()
-    if not np.isfinite(mesh.vertices).all():
-        raise InputError(f"{function}(): {path} has vertices that are NaN or infinite; expected finite coordinates.")
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    return mesh.apply_scale(scale)
-
-
 def _read_array(path: Path) -> np.ndarray:
     readers = {".npy": _read_npy, ".npz": _read_npz, ".xyz": _read_xyz, ".pcd": _read_pcd}
     try:
         return readers[path.suffix.lower()](path)
     except (OSError, ValueError, EOFError, LookupError, zipfile.BadZipFile) as error:
-        raise _unreadable("load_points", path, error) from error
+        raise unreadable("load_points", path, error) from error
 
 
 def _read_npy(path: Path) -> np.ndarray:

@@ -4,6 +4,7 @@ import json
 import pickle
 import re
 import sys
+import typing
 import zipfile
 
 import jax
@@ -199,7 +200,7 @@ def test_json_is_the_record_alone(weights, tmp_path, capsys):
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES - {"imitation.png", "loss.png"}
 
 
-@pytest.mark.parametrize("command", [(), ("imitate",), ("convert",), ("evaluate",), ("train",)])
+@pytest.mark.parametrize("command", [(), ("imitate",), ("convert",), ("evaluate",), ("dataset",), ("train",)])
 def test_help(capsys, command):
     with pytest.raises(SystemExit) as stop:
         run(*command, "--help")
@@ -457,6 +458,117 @@ def test_train_refuses_unwritable_places_before_training(refusal, tmp_path, monk
         check(refusal("train", "--out", tmp_path / "run", "--weights", place), "^tdf: error: tdf train: --weights is")
 
 
+# Evaluation
+
+
+@pytest.fixture(scope="module")
+def real(tmp_path_factory):
+    """A folder of one annotated mesh, in centimetres."""
+    folder = tmp_path_factory.mktemp("real")
+    build_mug().mesh.copy().apply_scale(100).export(folder / "cup.obj")
+    (folder / "meshes.json").write_text(json.dumps({"cup.obj": {"unit": 0.01, "up": "+z", "handle": "+x"}}))
+    return folder
+
+
+EVALUATE = ("--pairs", 2, "--inits", 2, "--iterations", 2, "--seed", 3)
+
+
+@pytest.fixture(scope="module")
+def evaluation(weights, real, tmp_path_factory):
+    """The record of a run with all options but pictures, and its model card."""
+    folder = tmp_path_factory.mktemp("evaluation")
+    words = ("--meshes", real, "--poses", 2, "--clouds", "full", "views1", "half", "--baselines")
+    run("evaluate", "--weights", weights, *EVALUATE, *words, "--json", folder / "scores.json", "--card", folder / "small.md")
+    assert {file.name for file in folder.iterdir()} == {"scores.json", "small.md"}
+    return json.loads((folder / "scores.json").read_text()), (folder / "small.md").read_text()
+
+
+def test_an_evaluation_has_a_row_for_every_method_condition_and_set(evaluation, real):
+    methods, conditions = ("small", "random weights", "PCA", "ICP"), ("full", "views1", "half")
+    expected = [(objects, cloud, method) for objects in ("generated mugs", "real meshes") for cloud in conditions for method in methods]
+    evaluation, _ = evaluation
+    rows = evaluation["rows"]
+    assert [(row["set"], row["clouds"], row["method"]) for row in rows] == expected
+    for row in rows:
+        generated = row["set"] == "generated mugs"
+        assert row["cases"] == len(row["errors"]) == 2 and row["objects"] == (2 if generated else 1)
+        assert [error["object"] for error in row["errors"]] == (["mug 0", "mug 1"] if generated else ["cup", "cup"])
+        assert (row["iou"] is None) == (row["method"] in ("PCA", "ICP"))
+        assert row["position_median_cm"] == pytest.approx(np.median([error["position_cm"] for error in row["errors"]]))
+        assert (row["interval_1cm_10deg"] is None) != generated
+    assert evaluation["settings"]["meshes"] == str(real) and evaluation["settings"]["seed"] == 3
+    assert evaluation["weights"] == {"name": "small", "source": "a test"}
+
+
+def test_a_plain_evaluation_gives_the_same_numbers_and_a_table(evaluation, weights, capsys, tmp_path):
+    run("evaluate", "--weights", weights, *EVALUATE, "--json", tmp_path / "scores.json")
+    (row,) = json.loads((tmp_path / "scores.json").read_text())["rows"]
+    assert row == evaluation[0]["rows"][0]
+    out, _ = capsys.readouterr()
+    title, heads, units, line = out.splitlines()
+    assert title == "generated mugs: 2 objects, 2 transfers; handle, best of 2 starts by loss"
+    cells = re.split(r"  +", line)
+    assert cells[:3] == ["small", "full", f"{row['iou']:.3f}"] and cells[-4] == str(row["flips"])
+    low, high = row["interval_2cm_20deg"]
+    assert cells[-1] == f"{100 * row['success_2cm_20deg']:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
+    ends = {name: heads.index(name) + len(name) for name in ("IoU", "rotation, deg", "flips", "2 cm, 20 deg")}
+    assert ends["2 cm, 20 deg"] == len(line) and line[: ends["IoU"]].endswith(cells[2]) and line[: ends["flips"]].endswith(cells[-4])
+
+
+def test_a_model_card_tells_what_the_record_does(evaluation):
+    record, card = evaluation
+    lines = card.splitlines()
+    assert lines[0] == "# small" and "| trained by | a test |" in lines
+    assert "Generated mugs: 2 mugs that no training run saw, 2 transfers." in lines
+    assert "`tdf evaluate --seed 3 --pairs 2 --inits 2 --iterations 2 --poses 2`" in card
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.count("|") == 10]
+    rows = [row for row in rows if row[0] not in ("cloud", "---")]
+    assert len(rows) == len(record["rows"]) == 24
+    for cells, row in zip(rows, record["rows"]):
+        assert cells[1] == row["method"] and cells[2] == ("n/a" if row["iou"] is None else f"{row['iou']:.3f}")
+        assert cells[3] == f"{row['position_median_cm']:.2f} / {row['position_p90_cm']:.2f} cm"
+        assert cells[-1].startswith(f"{100 * row['success_2cm_20deg']:.0f} %")
+
+
+def test_pictures_of_an_evaluation(weights, real, tmp_path, monkeypatch):
+    drawn, triangle = [], np.array([[[0, 0, 0], [0.05, 0, 0], [0, 0.05, 0.01]]])
+    monkeypatch.setattr("tdf_jax.cli.pictures.reconstructed", lambda field, T, bounds: drawn.append(bounds) or triangle)
+    monkeypatch.setattr("tdf_jax.cli.pictures.MOST_GENERATED", 1)
+    run("evaluate", "--weights", weights, *EVALUATE, "--meshes", real, "--poses", 2, "--figures", tmp_path / "pictures")
+    assert {path.name for path in (tmp_path / "pictures").iterdir()} == {"reconstructions.png", "transfers.png"}
+    assert (tmp_path / "pictures" / "transfers.png").read_bytes().startswith(b"\x89PNG")
+    assert len(drawn) == 2  # one generated mug, and the real one in one of its poses
+    np.testing.assert_allclose(drawn[1], build_mug().mesh.bounds, atol=1e-4)
+
+
+def test_every_condition_can_be_asked_for():
+    from tdf_jax.cli.evaluate import Cloud
+    from tdf_jax.evaluation.clouds import CONDITIONS
+
+    assert typing.get_args(Cloud) == (*CONDITIONS, "all")
+
+
+@pytest.mark.parametrize(("words", "message"), [
+    (("--pairs", "0"), "--pairs is 0; expected at least 1, or 0 with --meshes"),
+    (("--pairs", "-1", "--meshes", "."), "--pairs is -1"),
+    (("--poses", "0"), "--poses is 0"),
+    (("--seed", "-1"), "--seed is -1"),
+    (("--height", "12"), "--height is 12.0; expected metres"),
+    (("--place", "spout"), "--place is 'spout'; expected handle, rim or base"),
+    (("--inits", "0"), "inits is 0"),
+    (("--clouds", "fog"), "views1"),
+    (("--meshes", "none"), "load_annotated.*there is no folder none"),
+    (("--meshes", "."), "load_annotated.*is empty"),
+    (("--json", "none/scores.json"), "--json is none/scores.json; expected a file in an existing folder"),
+    (("--json", "."), "--json is ."),
+    (("--card", "none/mug.md"), "--card is none/mug.md; expected a file in an existing folder"),
+    (("--figures", "none/pictures"), "--figures is none/pictures; expected a folder"),
+])  # fmt: skip
+def test_bad_evaluations_are_refused_before_any_work(refusal, monkeypatch, words, message):
+    monkeypatch.setattr("tdf_jax.checkpoint.load_model", lambda name: pytest.fail("the work has begun"))
+    check(refusal("evaluate", *words), message)
+
+
 # Endings that are no mistakes
 
 
@@ -493,6 +605,6 @@ def test_every_start_non_finite_is_told(refusal, weights, monkeypatch):
 
 
 def test_commands_are_the_functions_of_their_modules():
-    assert set(command_line.COMMANDS) == {"imitate", "convert", "evaluate", "train"}
+    assert set(command_line.COMMANDS) == {"imitate", "convert", "evaluate", "dataset", "train"}
     for name in command_line.COMMANDS:
         assert callable(getattr(sys.modules[f"tdf_jax.cli.{name}"], name))

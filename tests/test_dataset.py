@@ -9,7 +9,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from tdf_jax.errors import InputError
-from tdf_jax.pointcloud import sample_surface
+from tdf_jax.meshes import sample_surface
 from tdf_jax.shapes import build_mug, sample_mug
 from tdf_jax.training import dataset, objects
 from tdf_jax.training.dataset import Recipe, build, load
@@ -127,14 +127,14 @@ def test_places_of_a_scanned_mesh_are_its_box_and_stretch_with_it(meshes):
 @pytest.mark.parametrize(
     ("mesh", "message"),
     [
-        (trimesh.creation.box(extents=(1, 1, 1e-4)), "0.0% of its bounding box"),
-        (trimesh.Trimesh(BOX.vertices, BOX.faces[:6]), r"\d+\.\d% of its bounding box, [1-9]\d?\.\d% undecided"),
+        (trimesh.creation.box(extents=(1, 1, 1e-4)), "encloses next to nothing"),
+        (trimesh.Trimesh(BOX.vertices, BOX.faces[:6]), "is open"),
     ],
 )
 def test_meshes_without_volume_are_refused(mesh, message, tmp_path):
     pytest.importorskip("igl")
     mesh.export(tmp_path / "sheet.obj")
-    with pytest.raises(InputError, match=rf"sheet\.obj encloses {message}.*; expected a closed surface"):
+    with pytest.raises(InputError, match=rf"sheet\.obj {message}.*; expected a closed surface"):
         canonical_mesh(tmp_path / "sheet.obj", 1.0, "+z", "+x")
 
 
@@ -221,8 +221,8 @@ def test_processes_give_the_same(tmp_path):
         ({"validation": 3}, "validation is 3; expected an even number"),
         ({"seed": -1}, "seed is -1"),
         ({"unit": 0.0}, "unit is 0.0; expected metres per unit"),
-        ({"up": "z"}, "'z' is no axis; expected a sign and a letter"),
-        ({"up": "+x", "front": "-x"}, r"up is \+x and front is -x; expected two axes at a right angle"),
+        ({"up": "z"}, "'z' is no axis; expected one of"),
+        ({"up": "+x", "front": "-x"}, r"up is \+x and front is -x, which are parallel"),
         ({"stretch": 2.0}, "stretch is 2.0"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Clouds and meshes: files of every kind and their damage, sampling, thinning, views."""
+"""Clouds, and the meshes they are sampled from: files of every kind and their damage, thinning."""
 
 import subprocess
 import sys
@@ -8,19 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from scipy.stats import kstest
 
 from tdf_jax.errors import InputError
-from tdf_jax.pointcloud import (
-    check_points,
-    load_mesh,
-    load_points,
-    merge_views,
-    sample_surface,
-    single_view,
-    thin,
-    thin_indices,
-)
+from tdf_jax.meshes import load_mesh
+from tdf_jax.pointcloud import check_points, load_points, thin, thin_indices
 
 CLOUD = np.random.default_rng(0).normal(size=(40, 3)).astype(np.float32)
 SUFFIXES = ["obj", "stl", "ply", "glb", "off"]
@@ -270,31 +261,6 @@ def test_check_points_inside_jit_checks_the_shape():
         jax.jit(check_points)(CLOUD[:20])
 
 
-def test_surface_samples_are_uniform_by_area():
-    """Two triangles of areas 1 and 3: a quarter of the points on the first, spread evenly within each."""
-    vertices = [[0, 0, 0], [2, 0, 0], [0, 1, 0], [0, 0, 5], [6, 0, 5], [0, 1, 5]]
-    mesh = trimesh.Trimesh(vertices, [[0, 1, 2], [3, 4, 5]], process=False)
-    points = sample_surface(mesh, 8000, np.random.default_rng(0))
-    first = points[:, 2] == 0
-    assert abs(first.mean() - 0.25) < 0.02
-    for part, width in ((points[first], 2), (points[~first], 6)):
-        x, y = part[:, 0] / width, part[:, 1]
-        assert (x >= 0).all() and (y >= 0).all() and (x + y <= 1 + 1e-12).all()
-        # Uniform on the unit triangle: P(x <= a) = 1 - (1 - a)^2, and the same for y and for 1 - x - y.
-        for coordinate in (x, y, 1 - x - y):
-            assert kstest(coordinate, lambda a: 1 - (1 - np.clip(a, 0, 1)) ** 2).pvalue > 0.01
-
-
-def test_surface_samples_follow_the_generator_and_refuse_nothing():
-    box = trimesh.creation.box((1, 2, 3))
-    first, second = (sample_surface(box, 5, np.random.default_rng(3)) for _ in range(2))
-    np.testing.assert_array_equal(first, second)
-    with pytest.raises(InputError, match="count is 0"):
-        sample_surface(box, 0, np.random.default_rng(0))
-    with pytest.raises(InputError, match="1 faces has no area"):
-        sample_surface(trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2]], process=False), 5, None)
-
-
 def test_thinning_by_hand():
     """On a line the mean is 3.4, so 10 is first, then 0; then 4 (4 away) before 3 (3) and 0.0."""
     points = np.array([[0, 0, 0], [3, 0, 0], [4, 0, 0], [10, 0, 0], [0, 0, 0]], np.float32)
@@ -330,46 +296,6 @@ def test_thinning_refuses_bad_input():
         thin(CLOUD, 0)
     with pytest.raises(InputError, match=r"shape \(40, 2\)"):
         thin(CLOUD[:, :2], 5)
-
-
-def sphere(count=600):
-    directions = np.random.default_rng(2).normal(size=(count, 3))
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
-
-
-def test_a_view_of_a_sphere_is_its_cap():
-    """From distance 4 a unit sphere is visible where x > 1/4; a band about the edge is left open."""
-    points = sphere()
-    seen = single_view(points, np.array([4.0, 0, 0]))
-    rows = [np.flatnonzero((points == point).all(axis=1)).item() for point in seen]
-    assert rows == sorted(rows)
-    visible = np.isin(np.arange(len(points)), rows)
-    assert visible[points[:, 0] > 0.5].all()
-    assert not visible[points[:, 0] < -0.1].any()
-    assert len(single_view(points, np.array([4.0, 0, 0]), reach=1e5)) > len(seen)
-
-
-def test_views_are_merged_without_repeats():
-    points = sphere()
-    cameras = 4 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0]])
-    merged = merge_views(points, cameras)
-    union = {tuple(point) for camera in cameras for point in single_view(points, camera)}
-    assert len(merged) == len(union)
-    assert {tuple(point) for point in merged} == union
-    assert merge_views(points.astype(np.float32), cameras).dtype == np.float32
-
-
-def test_views_refuse_bad_input():
-    points = sphere(50)
-    with pytest.raises(InputError, match="reach is 1"):
-        single_view(points, np.array([4.0, 0, 0]), reach=1)
-    with pytest.raises(InputError, match="at one of the points"):
-        single_view(points, points[7])
-    with pytest.raises(InputError, match="in one plane"):
-        single_view(points * [1, 1, 0], np.array([4.0, 0, 0]))
-    for bad_points, cameras in [(points[:, :2], np.eye(3)), (points, np.eye(2)), (points, np.zeros((0, 3)))]:
-        with pytest.raises(InputError, match="expected \\(points, 3\\) and \\(cameras, 3\\)"):
-            merge_views(bad_points, cameras)
 
 
 def test_importing_does_not_load_trimesh():

@@ -10,6 +10,7 @@ import pytest
 
 from tdf_jax.errors import InputError
 from tdf_jax.network import NetworkConfig, parameter_shapes
+from tdf_jax.optimize import OptimizeConfig
 from tdf_jax.training import dataset, loop, record
 from tdf_jax.training.config import TrainConfig
 from tdf_jax.training.dataset import Recipe
@@ -45,6 +46,7 @@ def train(sets, quick_compilation):
     """`loop.train` on small clouds. An optimiser is part of the step's cache key: kept, all tests compile it once."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "_optimiser", functools.cache(loop._optimiser))
+        patch.setattr(loop, "TRANSFER", OptimizeConfig(inits=2, iterations=2))
         patch.setattr("tdf_jax.training.batch.SPARSE_CLOUDS", (40, 300))
         patch.setattr("tdf_jax.training.batch.DIAGONALS", (0.12, 0.25))  # half a metre is too much for so small a network
         yield lambda config, directory, **options: loop.train(config, *sets, directory, progress=False, **options)
@@ -73,6 +75,7 @@ def test_training_lowers_the_loss(whole):
     for name in ("validation", "one_view"):
         assert set(rows[-1][name]) == {"loss", "bce", "frame", "place", "iou"}
     assert rows[-1]["validation"] != rows[-1]["one_view"]
+    assert set(rows[-1]["transfer"]) == {"position_cm", "rotation_deg", "success"}
     shapes = {".".join(key.key for key in path): leaf.shape for path, leaf in jax.tree.leaves_with_path(params)}
     assert shapes == dict(parameter_shapes(NETWORK))
 
@@ -163,11 +166,24 @@ def test_curves_show_training_and_both_validations(whole):
     panels = training_figure(rows).axes
     assert len(panels) == 4
     for panel, name in zip(panels, ("bce", "iou", "frame", "place")):
-        training, full, view = panel.lines
+        training, full, view, *others = panel.lines
         np.testing.assert_allclose(training.get_ydata()[-1], np.mean([row[name] for row in rows]), rtol=1e-6)
         assert list(full.get_xdata()) == [20, 40]
         np.testing.assert_allclose(full.get_ydata(), [row["validation"][name] for row in rows if "validation" in row])
         np.testing.assert_allclose(view.get_ydata(), [row["one_view"][name] for row in rows if "one_view" in row])
+        assert len(others) == (name == "iou")
+        for line in others:
+            np.testing.assert_allclose(line.get_ydata(), [row["transfer"]["success"] for row in rows if "transfer" in row])
+
+
+def test_transfers_of_validation_objects_have_their_truth(sets):
+    """An object laid on itself by its place's truth is itself again."""
+    validation = dataclasses.replace(sets[1], **{f.name: getattr(sets[1], f.name)[[0, 0]] for f in dataclasses.fields(sets[1])})
+    (transfer,) = loop._transfers(validation)
+    T = transfer.T_world_place_b @ np.linalg.inv(transfer.T_world_place_a)
+    np.testing.assert_allclose(transfer.points_a @ T[:3, :3].T + T[:3, 3], transfer.points_b, atol=1e-5)
+    assert np.abs(T - np.eye(4)).max() > 0.1
+    np.testing.assert_allclose(np.linalg.norm(np.ptp(transfer.points_a, axis=0)), loop.VALIDATION_DIAGONAL, rtol=0.05)
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,14 @@
-"""What cameras see, against marching along the rays through exact solids."""
+"""What cameras see: of clouds by hidden point removal; of meshes, against marching along the rays through exact solids."""
 
 import numpy as np
 import pytest
 import trimesh
 
 from tdf_jax import views
-from tdf_jax.pointcloud import sample_surface
+from tdf_jax.errors import InputError
+from tdf_jax.meshes import sample_surface
 from tdf_jax.shapes import build_mug, sample_mug
+from tdf_jax.views import merge_views, single_view
 
 
 def truly_visible(mug, points, direction):
@@ -58,3 +60,43 @@ def test_cameras_are_all_around_and_turned_by_chance():
     rng = np.random.default_rng(2).normal(size=(500, 3))
     covered = (rng / np.linalg.norm(rng, axis=1, keepdims=True) @ first.T).max(axis=1)
     assert covered.min() > np.cos(np.radians(45))  # no direction far from all
+
+
+def sphere(count=600):
+    directions = np.random.default_rng(2).normal(size=(count, 3))
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def test_a_view_of_a_sphere_is_its_cap():
+    """From distance 4 a unit sphere is visible where x > 1/4; a band about the edge is left open."""
+    points = sphere()
+    seen = single_view(points, np.array([4.0, 0, 0]))
+    rows = [np.flatnonzero((points == point).all(axis=1)).item() for point in seen]
+    assert rows == sorted(rows)
+    visible = np.isin(np.arange(len(points)), rows)
+    assert visible[points[:, 0] > 0.5].all()
+    assert not visible[points[:, 0] < -0.1].any()
+    assert len(single_view(points, np.array([4.0, 0, 0]), reach=1e5)) > len(seen)
+
+
+def test_views_are_merged_without_repeats():
+    points = sphere()
+    cameras = 4 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0]])
+    merged = merge_views(points, cameras)
+    union = {tuple(point) for camera in cameras for point in single_view(points, camera)}
+    assert len(merged) == len(union)
+    assert {tuple(point) for point in merged} == union
+    assert merge_views(points.astype(np.float32), cameras).dtype == np.float32
+
+
+def test_views_refuse_bad_input():
+    points = sphere(50)
+    with pytest.raises(InputError, match="reach is 1"):
+        single_view(points, np.array([4.0, 0, 0]), reach=1)
+    with pytest.raises(InputError, match="at one of the points"):
+        single_view(points, points[7])
+    with pytest.raises(InputError, match="in one plane"):
+        single_view(points * [1, 1, 0], np.array([4.0, 0, 0]))
+    for bad_points, cameras in [(points[:, :2], np.eye(3)), (points, np.eye(2)), (points, np.zeros((0, 3)))]:
+        with pytest.raises(InputError, match="expected \\(points, 3\\) and \\(cameras, 3\\)"):
+            merge_views(bad_points, cameras)

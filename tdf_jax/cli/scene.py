@@ -11,7 +11,8 @@ from tdf_jax.demonstration import Demonstration
 from tdf_jax.errors import InputError
 from tdf_jax.evaluation.cases import Case, mug_case, random_pose
 from tdf_jax.evaluation.truth import expected_trajectory
-from tdf_jax.pointcloud import load_mesh, load_points
+from tdf_jax.meshes import load_mesh
+from tdf_jax.pointcloud import load_points
 from tdf_jax.query import box_query
 from tdf_jax.recording import load_demonstration
 from tdf_jax.trajectory import Trajectory, line, resample, semicircle, wave

@@ -1,13 +1,17 @@
 """Pairs of objects with a demonstrated pose on one and the true pose on the other."""
 
 import dataclasses
+import zlib
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from tdf_jax import poses
-from tdf_jax.pointcloud import sample_surface
+from tdf_jax.errors import InputError
+from tdf_jax.evaluation.annotated import AnnotatedMesh
+from tdf_jax.evaluation.clouds import CONDITIONS, SCALES, observed
+from tdf_jax.meshes import sample_surface
 from tdf_jax.shapes import Mug, build_mug, sample_mug, scaled
 
 SEED_SPACE = 7_000_001  # keeps evaluation objects apart from training's, which are drawn from [seed, index]
@@ -16,25 +20,45 @@ POSE_STREAM = 0x7D05E
 
 
 @dataclasses.dataclass(frozen=True)
-class Case:
-    """One transfer between two objects, in the world.
+class Transfer:
+    """A pose demonstrated on one object, to be found on another, in the world.
 
     Attributes:
         points_a: cloud of the demonstration's object, which lies in its canonical frame, (points, 3), metres.
         points_b: cloud of the new object, in a random pose.
         T_world_place_a: the semantic place on object a, 4x4.
         T_world_place_b: the same place on object b: the truth.
-        object_a, object_b: the objects, in their canonical frames.
-        T_world_b: pose of object b's canonical frame, 4x4.
+        scale: of both objects, and so of the query, over a common mug's size.
     """
 
     points_a: Float[np.ndarray, "points 3"]
-    points_b: Float[np.ndarray, "points 3"]
+    points_b: Float[np.ndarray, "seen 3"]
     T_world_place_a: Float[np.ndarray, "4 4"]
     T_world_place_b: Float[np.ndarray, "4 4"]
+    scale: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Case(Transfer):
+    """A transfer between objects whose shapes are known; `points_b` is as `clouds` says.
+
+    Attributes:
+        object_a, object_b: the objects, in their canonical frames.
+        T_world_b: pose of object b's canonical frame, 4x4.
+        instance: name of object b; cases of one object in several poses share it.
+        clouds: the condition of `points_b`, one of `tdf_jax.evaluation.clouds.CONDITIONS`.
+    """
+
     object_a: Mug
-    object_b: Mug
+    object_b: Mug | AnnotatedMesh
     T_world_b: Float[np.ndarray, "4 4"]
+    instance: str
+    clouds: str
+
+    @property
+    def diagonal(self) -> float:
+        """Of object b's bounding box, metres."""
+        return float(np.linalg.norm(self.object_b.mesh.extents))
 
 
 def mug_of(seed: int, index: int, height: float) -> Mug:
@@ -52,20 +76,58 @@ def random_pose(seed: int, index: int, reach: float = 0.3) -> Float[np.ndarray, 
     return T
 
 
-def mug_case(seed: int, index: int, *, height: float = 0.12, points: int = 1500, place: str = "handle") -> Case:
+def mug_case(
+    seed: int, index: int, *, height: float = 0.12, points: int = 1500, place: str = "handle", clouds: str = "full"
+) -> Case:
     """Pair `index` of a seed: two unseen generated mugs of one height, the second under a random pose.
 
     Args:
         seed, index: which pair.
-        height: of both mugs, metres.
-        points: of each cloud, uniform by area.
+        height: of both mugs, metres, before a condition of size.
+        points: of each complete cloud, uniform by area.
         place: "handle", "rim" or "base".
+        clouds: the condition of the second mug's cloud; mugs and poses do not depend on it.
+
+    Raises:
+        InputError: there is no such condition.
     """
-    a, b = (mug_of(seed, 2 * index + which, height) for which in range(2))
-    rng = np.random.default_rng([SEED_SPACE, seed, index, 1])
-    cloud_a, cloud_b = (sample_surface(mug.mesh, points, rng) for mug in (a, b))
-    T_world_b = random_pose(seed, index)
-    points_b = cloud_b @ T_world_b[:3, :3].T + T_world_b[:3, 3]
+    scale = _scale("mug_case", clouds)
+    a, b = (mug_of(seed, 2 * index + which, height * scale) for which in range(2))
+    return _case(a, b, seed, index, points, place, clouds, f"mug {index}")
+
+
+def mesh_case(
+    seed: int, pose: int, target: AnnotatedMesh, *, points: int = 1500, place: str = "handle", clouds: str = "full"
+) -> Case:
+    """Random pose `pose` of a real mesh at its own size, demonstrated on an unseen generated mug of its height.
+
+    Args:
+        seed, pose: which mug and pose; they depend on the mesh's name too, but not on other meshes.
+        target: the mesh.
+        points, place, clouds: see `mug_case`.
+
+    Raises:
+        InputError: there is no such condition.
+    """
+    scale = _scale("mesh_case", clouds)
+    number = zlib.crc32(f"{target.name}/{pose}".encode())
+    b = target if scale == 1 else target.scaled(scale)
+    return _case(mug_of(seed, number, b.height), b, seed, number, points, place, clouds, target.name)
+
+
+def _scale(function: str, clouds: str) -> float:
+    if clouds not in CONDITIONS:
+        raise InputError(f"{function}(): clouds is {clouds!r}; expected one of {', '.join(CONDITIONS)}")
+    return SCALES.get(clouds, 1.0)
+
+
+def _case(a: Mug, b: Mug | AnnotatedMesh, seed: int, number: int, points: int, place: str, clouds: str, instance: str) -> Case:
+    rng = np.random.default_rng([SEED_SPACE, seed, number, 1])
+    cloud_a, cloud_b = (sample_surface(one.mesh, points, rng) for one in (a, b))
+    # A stream of its own, the same for all conditions: they differ by the condition, not by chance.
+    seen = observed(b.mesh, clouds, cloud_b, np.random.default_rng([SEED_SPACE, seed, number, 2]))
+    T_world_b = random_pose(seed, number)
+    points_b = seen @ T_world_b[:3, :3].T + T_world_b[:3, 3]
     return Case(
         points_a=cloud_a.astype(np.float32),
         points_b=points_b.astype(np.float32),
@@ -74,4 +136,7 @@ def mug_case(seed: int, index: int, *, height: float = 0.12, points: int = 1500,
         object_a=a,
         object_b=b,
         T_world_b=T_world_b,
+        instance=instance,
+        clouds=clouds,
+        scale=SCALES.get(clouds, 1.0),
     )

@@ -14,8 +14,8 @@ from tqdm import tqdm
 
 from tdf_jax.errors import InputError
 from tdf_jax.files import replace_file
-from tdf_jax.pointcloud import MESH_SUFFIXES
-from tdf_jax.training.objects import UNIFORM_SHARE, Labelled, axis, canonical_mesh, generated_mug, scanned_object
+from tdf_jax.meshes import MESH_SUFFIXES, file_axes
+from tdf_jax.training.objects import UNIFORM_SHARE, Labelled, canonical_mesh, generated_mug, scanned_object
 
 MANIFEST = "dataset.json"
 SHARD = 50  # objects in a file, 12 MB: what a kill can lose is less than half a minute's work
@@ -67,8 +67,7 @@ class Recipe:
             raise InputError(f"Recipe(): unit is {self.unit}; expected metres per unit of the files, such as 0.001")
         if not 0 <= self.stretch <= 1:
             raise InputError(f"Recipe(): stretch is {self.stretch}; expected 0 to 1")
-        if axis(self.up) @ axis(self.front):
-            raise InputError(f"Recipe(): up is {self.up} and front is {self.front}; expected two axes at a right angle")
+        file_axes(self.up, self.front)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 from tdf_jax import views
 from tdf_jax.errors import InputError
-from tdf_jax.pointcloud import load_mesh, sample_surface
+from tdf_jax.meshes import file_axes, inside, load_mesh, sample_surface, winding_number
 from tdf_jax.shapes import build_mug, sample_mug
 
 UNIFORM_SHARE = 0.5  # of the query points: uniform in the padded bounding box; the rest lie near the surface
@@ -19,7 +19,6 @@ BOX_PADDING = 0.10  # of the diagonal, on every side
 NEAR_SPREADS = (0.012, 0.05)  # standard deviations, of the diagonal
 MUG_PLACES = ("handle", "rim", "base")
 LEAST_INSIDE = 0.002  # of the uniform query points; a mug has 0.05 to 0.15, a bowl of thin steel 0.008
-MOST_UNDECIDED = 0.03  # of the uniform query points: neither in nor out of an open mesh; a mug whose handle is open at its ends has none
 
 
 class Labelled(NamedTuple):
@@ -100,43 +99,15 @@ def canonical_mesh(path, unit: float, up: str, front: str) -> "trimesh.Trimesh":
         InputError: the file is no mesh, or encloses nothing, or has holes too large to tell inside from outside.
     """
     mesh = load_mesh(path, scale=unit)
-    z, x = axis(up), axis(front)
-    mesh.vertices = mesh.vertices @ np.stack([x, np.cross(z, x), z], axis=1)
+    mesh.vertices = mesh.vertices @ file_axes(up, front)
     mesh.apply_translation(-mesh.bounds.mean(axis=0))
     pad = BOX_PADDING * np.linalg.norm(mesh.extents)
     x = np.random.default_rng(0).uniform(mesh.bounds[0] - pad, mesh.bounds[1] + pad, (4000, 3))
-    winding = np.abs(winding_number(mesh, x))
-    undecided = np.mean((winding > 0.25) & (winding < 0.75))
-    if np.mean(winding > 0.5) < LEAST_INSIDE or undecided > MOST_UNDECIDED:
+    enclosed = inside(mesh, x)
+    if enclosed is None or enclosed.mean() < LEAST_INSIDE:
+        got = "is open: much of its bounding box is neither inside nor outside" if enclosed is None else "encloses next to nothing"
         raise InputError(
-            f"canonical_mesh(): {path} encloses {np.mean(winding > 0.5):.1%} of its bounding box, {undecided:.1%} undecided; expected a "
-            "closed surface, or one with small holes, of a solid with walls: give it thickness, or leave it out"
+            f"canonical_mesh(): {path} {got}; expected a closed surface, or one with small holes, of a solid with walls: "
+            "give it thickness, or leave it out"
         )
     return mesh
-
-
-def axis(name: str) -> Float[np.ndarray, "3"]:
-    """The unit vector of "+x", "-x", "+y", ...
-
-    Raises:
-        InputError: any other name.
-    """
-    if len(name) != 2 or name[0] not in "+-" or name[1] not in "xyz":
-        raise InputError(f"axis(): {name!r} is no axis; expected a sign and a letter, such as +z or -x")
-    return np.eye(3)["xyz".index(name[1])] * (1.0 if name[0] == "+" else -1.0)
-
-
-def winding_number(mesh: "trimesh.Trimesh", x: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points"]:
-    """The generalised winding number of points: 1 inside, 0 outside, in between where a surface is open.
-
-    Raises:
-        InputError: libigl is not installed.
-
-    Source:
-        Barill, Dickson, Schmidt, Levin, Jacobson, Fast winding numbers for soups and clouds, SIGGRAPH 2018.
-    """
-    try:
-        import igl
-    except ImportError:
-        raise InputError("winding_number(): libigl is not installed; try: pip install 'tdf_jax[mesh]'") from None
-    return igl.fast_winding_number(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64), np.asarray(x, float))

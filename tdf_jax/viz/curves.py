@@ -10,7 +10,7 @@ from tdf_jax.viz.plots import INK, STYLE, TRUTH
 
 PANELS = (
     ("bce", "occupancy: binary cross-entropy", "log"),
-    ("iou", "occupancy: IoU at 0.5", "linear"),
+    ("iou", "occupancy: IoU at 0.5; transfer: success", "linear"),
     ("frame", "frame read out of the latent: squared error", "log"),
     ("place", "places: -log share of the right pose", "linear"),
 )
@@ -40,7 +40,10 @@ def training_figure(rows: Sequence[dict]) -> Figure:
                 panel.yaxis.set_major_formatter("{x:g}")
                 panel.yaxis.set_minor_formatter("")
             panel.grid(color="#dddddd", lw=0.5)
+        shares = [(row["step"], row["transfer"]["success"]) for row in rows if "transfer" in row]
+        transfer = axes[0, 1].plot(*np.array(shares).reshape(-1, 2).T, color="#2a6f97", ls="--", marker="o", ms=2.5, lw=1)
         axes[0, 0].legend(frameon=False)
+        axes[0, 1].legend(transfer, ["transfers within 2 cm and 20°"], frameon=False)
         for panel in axes[1]:
             panel.set_xlabel("step")
     return figure

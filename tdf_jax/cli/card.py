@@ -1,0 +1,80 @@
+"""The model card of `tdf evaluate --card`: what weights are, what they were measured to do, what they do not know."""
+
+from pathlib import Path
+
+from tdf_jax.cli.scores import GENERATED, THRESHOLDS, Outcomes
+from tdf_jax.files import replace_file
+from tdf_jax.model import Model
+from tdf_jax.network import parameter_count
+
+MEANINGS = {
+    "full": "complete, 1500 points",
+    "views4": "seen by four depth cameras",
+    "views2": "seen by two",
+    "views1": "seen by one",
+    "points300": "300 points",
+    "points1000": "1000 points",
+    "points3000": "3000 points",
+    "noise": "300 points, 2 mm noise",
+    "half": "half as large",
+    "double": "twice as large",
+}
+
+
+def card(model: Model, outcomes: Outcomes, settings: dict) -> str:
+    """A model card in Markdown.
+
+    Args:
+        model: the network.
+        outcomes: of it and of baselines, by objects and condition of the cloud.
+        settings: of the evaluation.
+    """
+    facts = {
+        "network": f"Neural Descriptor Fields occupancy network, latent {model.config.latent}, {parameter_count(model.config):,} parameters, float32",
+        "trained by": model.info.source,
+        "input": f"a cloud of any density, thinned to {model.info.cloud_points} farthest points (`imitate` does it), any pose",
+    }
+    lines = [f"# {model.info.name}", "", "| what | value |", "|---|---|", *(f"| {what} | {value} |" for what, value in facts.items()), ""]
+    lines += ["## Transfer of one pose", "", _told(settings), ""]
+    for objects in dict.fromkeys(name for name, _ in outcomes):
+        rows = [(clouds, outcome) for (name, clouds), several in outcomes.items() if name == objects for outcome in several]
+        first = rows[0][1].summary
+        kind = "mugs that no training run saw" if objects == GENERATED else "real mugs, at their own size, none seen in training"
+        lines += [f"{objects.capitalize()}: {first['objects']} {kind}, {first['cases']} transfers.", ""]
+        heads = ["cloud", "method", "IoU", "position, median / 90 %", "rotation, median / 90 %", "flips", *THRESHOLDS.values()]
+        lines += [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
+        lines += [f"| {' | '.join(_cells(clouds, outcome))} |" for clouds, outcome in rows]
+        lines += [""]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def write(path: Path, text: str) -> None:
+    """Write a card, whole or not at all.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    replace_file("tdf evaluate", path, text.encode())
+
+
+def _told(settings: dict) -> str:
+    options = {name: settings[name] for name in ("seed", "pairs", "inits", "iterations", "poses")}
+    told = " ".join(f"--{name} {value}" for name, value in options.items())
+    return (
+        f"One pose at the {settings['place']}, shown on a generated mug of the same height, target in a uniform random pose, best of "
+        f"{settings['inits']} starts by loss (`tdf evaluate {told}`). Success: position and rotation error both within the bounds; in brackets "
+        "the 95 % bootstrap interval over objects."
+    )
+
+
+def _cells(clouds, outcome) -> list[str]:
+    row = outcome.summary
+    cells = [MEANINGS[clouds], outcome.method, "n/a" if row["iou"] is None else f"{row['iou']:.3f}"]
+    cells.append(f"{row['position_median_cm']:.2f} / {row['position_p90_cm']:.2f} cm")
+    cells.append(f"{row['rotation_median_deg']:.1f} / {row['rotation_p90_deg']:.1f}°")
+    cells.append(str(row["flips"]))
+    for name in THRESHOLDS:
+        interval = row[f"interval_{name}"]
+        words = "" if interval is None else " ({:.0f} to {:.0f})".format(*(100 * x for x in interval))
+        cells.append(f"{100 * row[f'success_{name}']:.0f} %{words}")
+    return cells

@@ -1,0 +1,78 @@
+"""Networks and baselines on the same cases."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from tdf_jax.evaluation.baselines import aligned
+from tdf_jax.evaluation.cases import Case
+from tdf_jax.evaluation.summary import summary
+from tdf_jax.evaluation.transfer import overlaps, place_errors, transferred
+from tdf_jax.model import Model
+from tdf_jax.network import initialise
+from tdf_jax.optimize import OptimizeConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What one method came to on some cases.
+
+    Attributes:
+        method: its name.
+        cases: what it was tried on.
+        found: poses `wxyz_xyz` of the place, world frame, (cases, 7).
+        distance: position errors, metres, (cases,).
+        angle: rotation errors, degrees, (cases,).
+        ious: intersections over union; None where there is no volume to compare.
+        summary: see `tdf_jax.evaluation.summary`.
+    """
+
+    method: str
+    cases: Sequence[Case]
+    found: Float[np.ndarray, "cases 7"]
+    distance: Float[np.ndarray, "cases"]
+    angle: Float[np.ndarray, "cases"]
+    ious: Sequence[float | None]
+    summary: dict
+
+
+def compare(
+    cases: Sequence[Case],
+    models: Mapping[str, Model],
+    baselines: Sequence[str] = (),
+    *,
+    seed: int = 0,
+    config: OptimizeConfig = OptimizeConfig(),
+    progress: bool = True,
+) -> list[Outcome]:
+    """Run networks and baselines on cases, each with `config.inits` starts.
+
+    Args:
+        cases: what to transfer.
+        models: networks by name.
+        baselines: of `tdf_jax.evaluation.baselines.METHODS`; they reconstruct nothing.
+        seed: of query points, starts and the bootstrap.
+        config: settings of the networks' optimiser.
+        progress: show progress bars.
+    """
+    outcomes = []
+    for name, model in models.items():
+        found = transferred(model, cases, seed=seed, config=config, progress=progress)
+        outcomes.append(_outcome(name, cases, found, overlaps(model, cases), seed))
+    for method in baselines:
+        found = aligned(method, cases, seed=seed, inits=config.inits, progress=progress)
+        outcomes.append(_outcome(method, cases, found, [None] * len(cases), seed))
+    return outcomes
+
+
+def random_weights(model: Model, seed: int) -> Model:
+    """A network of the same sizes that learnt nothing."""
+    return dataclasses.replace(model, params=initialise(jax.random.key(seed), model.config))
+
+
+def _outcome(method, cases, found, ious, seed) -> Outcome:
+    distance, angle = place_errors(found, cases)
+    return Outcome(method, cases, found, distance, angle, ious, summary(distance, angle, ious, cases, seed))

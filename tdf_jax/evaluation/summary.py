@@ -1,0 +1,60 @@
+"""What errors over many cases amount to: medians, success rates and how sure they are."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from tdf_jax.evaluation.cases import Case
+from tdf_jax.evaluation.truth import FLIP_DEGREES
+
+THRESHOLDS = {"5mm_5deg": (0.005, 5.0), "1cm_10deg": (0.01, 10.0), "2cm_20deg": (0.02, 20.0)}  # metres, degrees
+RESAMPLES = 2000  # of the bootstrap
+
+
+def summary(
+    distance: Float[np.ndarray, "cases"],
+    angle: Float[np.ndarray, "cases"],
+    ious: Sequence[float | None],
+    cases: Sequence[Case],
+    seed: int = 0,
+) -> dict:
+    """Medians, 90th percentiles, success rates with 95 % bootstrap intervals over objects, and flips.
+
+    Poses of one object are not independent: whole objects are drawn, each with all of its poses.
+
+    Args:
+        distance: position errors, metres.
+        angle: rotation errors, degrees.
+        ious: None where there is none.
+        cases: what the errors are of.
+        seed: of the bootstrap.
+
+    Returns:
+        Plain numbers by name; None for the IoU where no case has one, and for the intervals of a single object.
+    """
+    share = distance / [case.diagonal for case in cases]
+    known = [iou for iou in ious if iou is not None]
+    names = list(dict.fromkeys(case.instance for case in cases))
+    member = np.array([names.index(case.instance) for case in cases])
+    drawn = np.random.default_rng(seed).choice(len(names), (RESAMPLES, len(names)))
+    row = {
+        "cases": len(cases),
+        "objects": len(names),
+        "iou": float(np.mean(known)) if known else None,
+        "iou_cases": len(known),
+        "position_median_cm": 100 * float(np.median(distance)),
+        "position_p90_cm": 100 * float(np.percentile(distance, 90)),
+        "position_median_diagonals": float(np.median(share)),
+        "position_p90_diagonals": float(np.percentile(share, 90)),
+        "rotation_median_deg": float(np.median(angle)),
+        "rotation_p90_deg": float(np.percentile(angle, 90)),
+        "flips": int(np.sum(angle > FLIP_DEGREES)),
+    }
+    for name, (metres, degrees) in THRESHOLDS.items():
+        hit = (distance <= metres) & (angle <= degrees)
+        hits, tries = np.bincount(member, hit), np.bincount(member)
+        rates = hits[drawn].sum(axis=1) / tries[drawn].sum(axis=1)
+        row[f"success_{name}"] = float(hit.mean())
+        row[f"interval_{name}"] = [float(x) for x in np.percentile(rates, (2.5, 97.5))] if len(names) > 1 else None
+    return row

@@ -1,0 +1,207 @@
+"""Pictures of an evaluation: what the network takes objects to be, and where it takes their places to be."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import matplotlib
+import numpy as np
+from jaxtyping import Float
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from mpl_toolkits.mplot3d.axes3d import Axes3D
+
+from tdf_jax.field import DescriptorField
+from tdf_jax.meshes import libigl
+from tdf_jax.viz import solid
+from tdf_jax.viz.plots import CENTIMETRES, INK, LIGHT, STYLE, TRUTH
+
+FOUND = "#2a6f97"
+VIEW = {"elev": 28, "azim": -55}  # into the cup, its handle to the right
+CELLS = 120  # along the diagonal of the box that is searched: 1.7 mm on a common mug; coarser ones tear its wall into stripes
+CHUNK = 20_000  # points evaluated at a time
+PIECES = 25  # longest edge of a drawn triangle, as a part of the diagonal; see `solid`
+COLUMNS = 5
+PANEL, WORDS, MARGIN = 1.7, 0.45, 0.35  # inches: edge of a panel, height of the words above it, and around all
+ZOOM = 1.6814  # with it, an orthographic panel shows as much as the axes' limits span
+BAR = 0.05  # metres, the scale bar
+
+
+@dataclasses.dataclass(frozen=True)
+class Panel:
+    """One object to draw, in its canonical frame.
+
+    Attributes:
+        name: of the object.
+        overlap: what is said of the reconstruction, a few words.
+        error: the same of the place that was found.
+        triangles: the true surface, metres.
+        found: the reconstructed surface, metres; may have no triangle.
+        T_object_true, T_object_found: the place's frame, and what was found for it, 4x4.
+        size: edge of the box of query points, metres.
+    """
+
+    name: str
+    overlap: str
+    error: str
+    triangles: Float[np.ndarray, "faces 3 3"]
+    found: Float[np.ndarray, "others 3 3"]
+    T_object_true: Float[np.ndarray, "4 4"]
+    T_object_found: Float[np.ndarray, "4 4"]
+    size: float
+
+
+def reconstructed(
+    field: DescriptorField, T_world_object: Float[np.ndarray, "4 4"], bounds: Float[np.ndarray, "2 3"]
+) -> Float[np.ndarray, "faces 3 3"]:
+    """The surface of occupancy 0.5, by marching cubes.
+
+    Args:
+        field: of an object in the world.
+        T_world_object: how the object's frame lies there, 4x4.
+        bounds: lowest and highest corner of the object, in its frame, metres; 5 % of the diagonal beyond are searched too.
+
+    Returns:
+        Triangles in the object's frame, metres; none if the occupancy is nowhere above 0.5.
+
+    Raises:
+        InputError: libigl is not installed.
+    """
+    igl = libigl("reconstructed()")
+    pad = 0.05 * np.linalg.norm(bounds[1] - bounds[0])
+    low, high = bounds[0] - pad, bounds[1] + pad
+    counts = np.maximum(2, np.ceil((high - low) / np.linalg.norm(high - low) * CELLS).astype(int) + 1)
+    z, y, x = np.meshgrid(*(np.linspace(low[i], high[i], counts[i]) for i in (2, 1, 0)), indexing="ij")
+    grid = np.stack([x, y, z], axis=-1).reshape(-1, 3)  # x runs fastest
+    world = grid @ T_world_object[:3, :3].T + T_world_object[:3, 3]
+    padded = np.zeros((-(-len(world) // CHUNK) * CHUNK, 3), np.float32)  # one shape for all objects: compiled once
+    padded[: len(world)] = world
+    values = np.concatenate([_logits(field, chunk) for chunk in padded.reshape(-1, CHUNK, 3)])[: len(world)]
+    vertices, faces, _ = igl.marching_cubes(values.astype(float), grid, *map(int, counts), 0.0)
+    return np.asarray(vertices)[np.asarray(faces)].reshape(-1, 3, 3)
+
+
+@jax.jit
+def _logits(field, x):
+    # Interpolated between grid points, probabilities that jump from 0 to 1 would give stairs.
+    p = jax.numpy.clip(field.occupancy(x), 1e-6, 1 - 1e-6)
+    return jax.numpy.log(p) - jax.numpy.log1p(-p)
+
+
+def reconstruction_figure(panels: Sequence[Panel], title: str = "") -> Figure:
+    """Every object's true surface above its reconstruction, all at one scale."""
+    contents = [np.concatenate([panel.triangles, panel.found]).reshape(-1, 3) for panel in panels]
+    edge = _edge(contents)
+    with matplotlib.rc_context(STYLE):
+        figure = _figure(len(panels), 2, title, edge)
+        for index, (panel, content) in enumerate(zip(panels, contents)):
+            for row, (label, triangles) in enumerate({"true": panel.triangles, "reconstructed": panel.found}.items()):
+                axes = _axes(figure, index, 2, row, label)
+                _draw(axes, _surface(triangles), content, edge)
+                if not len(triangles):
+                    axes.text2D(0.5, 0.5, "empty", ha="center", transform=axes.transAxes)
+            _name(figure, index, 2, f"{panel.name}\n{panel.overlap}")
+    return figure
+
+
+def transfer_figure(panels: Sequence[Panel], title: str = "") -> Figure:
+    """Every object with the box of query points at the true place, dashed, and where it was found, all at one scale."""
+    true, found = ([_corners(T, panel.size) for T, panel in zip(several, panels)] for several in (
+        [panel.T_object_true for panel in panels], [panel.T_object_found for panel in panels]))  # fmt: skip
+    contents = []
+    for panel, *boxes in zip(panels, true, found):
+        low, high = panel.triangles.min(axis=(0, 1)), panel.triangles.max(axis=(0, 1))
+        reach = (high - low).max()  # a box found still farther away is cut, rather than make the others small
+        contents.append(np.concatenate([panel.triangles.reshape(-1, 3), np.clip(np.concatenate(boxes), low - reach, high + reach)]))
+    edge = _edge(contents)
+    with matplotlib.rc_context(STYLE):
+        figure = _figure(len(panels), 1, title, edge)
+        for index, panel in enumerate(panels):
+            pieces = _surface(panel.triangles)
+            pieces += solid.box(CENTIMETRES * true[index], TRUTH, filled=False, dashed=True)
+            pieces += solid.box(CENTIMETRES * found[index], FOUND)
+            _draw(_axes(figure, index, 1, 0, ""), pieces, contents[index], edge)
+            _name(figure, index, 1, f"{panel.name}\n{panel.error}")
+        lines = [Line2D([], [], color=TRUTH, ls=(0, (3, 2))), Line2D([], [], color=FOUND)]
+        words = ["query box at the true place", "found; the filled face is +x"]
+        figure.legend(lines, words, loc="lower right", ncols=2, frameon=False, bbox_to_anchor=(1.0, 0.0))
+    return figure
+
+
+def _figure(count: int, rows: int, title: str, edge: float) -> Figure:
+    """Room for blocks of `COLUMNS` objects below each other, each of so many rows; with a title and a scale bar."""
+    blocks = -(-count // COLUMNS)
+    width = max(2 * MARGIN + min(COLUMNS, count) * PANEL, 5.2)
+    height = 2 * MARGIN + blocks * (WORDS + rows * PANEL)
+    figure = Figure(figsize=(width, height), facecolor="white")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, y=1 - 0.1 / height, va="top")
+    x, y, length = 0.2 / width, 0.17 / height, BAR / edge * PANEL / width
+    figure.add_artist(Line2D([x, x + length], [y, y], color=INK, lw=2, solid_capstyle="butt"))
+    figure.text(x + length + 0.08 / width, y, f"{CENTIMETRES * BAR:.0f} cm", va="center")
+    return figure
+
+
+def _corner(figure: Figure, index: int, rows: int) -> tuple[float, float]:
+    """Left and top of an object's panels, inches from the lower left."""
+    block, column = divmod(index, COLUMNS)
+    return MARGIN + column * PANEL, figure.get_figheight() - MARGIN - WORDS - block * (WORDS + rows * PANEL)
+
+
+def _name(figure: Figure, index: int, rows: int, words: str) -> None:
+    x, y = _corner(figure, index, rows)
+    figure.text((x + PANEL / 2) / figure.get_figwidth(), (y + 0.04) / figure.get_figheight(), words, ha="center", va="bottom")
+
+
+def _axes(figure: Figure, index: int, rows: int, row: int, label: str) -> Axes3D:
+    x, y = _corner(figure, index, rows)
+    y -= (row + 1) * PANEL
+    width, height = figure.get_figwidth(), figure.get_figheight()
+    if label and index % COLUMNS == 0:
+        figure.text((x - 0.12) / width, (y + PANEL / 2) / height, label, rotation=90, va="center", ha="center")
+    return figure.add_axes((x / width, y / height, PANEL / width, PANEL / height), projection="3d")
+
+
+def _surface(triangles) -> solid.Pieces:
+    """Shaded pieces, in centimetres, cut small enough to be painted in the right order."""
+    from trimesh.remesh import subdivide_to_size
+
+    if not len(triangles):
+        return solid.Pieces([], [], [])
+    corners = triangles.reshape(-1, 3)
+    longest = np.linalg.norm(np.ptp(corners, axis=0)) / PIECES
+    vertices, faces = subdivide_to_size(corners, np.arange(len(corners)).reshape(-1, 3), longest, max_iter=20)
+    return solid.surface(CENTIMETRES * vertices[faces], LIGHT)
+
+
+def _corners(T, size):
+    return size * (solid.CORNERS - 0.5) @ T[:3, :3].T + T[:3, 3]
+
+
+def _across() -> np.ndarray:
+    """The view's directions to the right and up, (2, 3)."""
+    up, around = np.radians(VIEW["elev"]), np.radians(VIEW["azim"])
+    return np.array([
+        [-np.sin(around), np.cos(around), 0.0],
+        [-np.sin(up) * np.cos(around), -np.sin(up) * np.sin(around), np.cos(up)],
+    ])  # fmt: skip
+
+
+def _edge(contents) -> float:
+    """Edge, metres, of the square that the largest content fills."""
+    return 1.04 * max(float(np.ptp(content @ _across().T, axis=0).max()) for content in contents)
+
+
+def _draw(axes: Axes3D, pieces: solid.Pieces, content, edge: float) -> None:
+    if pieces.polygons:
+        axes.add_collection3d(pieces.collection(), autolim=False)
+    seen = content @ _across().T
+    middle = (seen.min(axis=0) + seen.max(axis=0)) / 2 @ _across()
+    for name, at in zip("xyz", middle):
+        getattr(axes, f"set_{name}lim")(CENTIMETRES * (at - edge / 2), CENTIMETRES * (at + edge / 2))
+    axes.set_proj_type("ortho")
+    axes.set_box_aspect((1, 1, 1), zoom=ZOOM)
+    axes.view_init(**VIEW)
+    axes.set_axis_off()
+    axes.patch.set_visible(False)
