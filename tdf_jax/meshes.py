@@ -93,7 +93,7 @@ def inside(mesh: "trimesh.Trimesh", x: Float[np.ndarray, "points 3"]) -> Bool[np
         x: spread over the mesh's bounding box and about it, in its unit.
 
     Returns:
-        True inside; None for an open surface: too many points that are neither clearly in nor out, `MOST_UNDECIDED` of those not clearly out.
+        True inside; None for an open surface: of the points not clearly outside, more than `MOST_UNDECIDED` are not clearly inside.
 
     Raises:
         InputError: libigl is not installed.

@@ -29,11 +29,14 @@ def card(model: Model, outcomes: Outcomes, settings: dict) -> str:
         outcomes: of it and of baselines, by objects and condition of the cloud.
         settings: of the evaluation.
     """
+    sizes = f"latent {model.config.latent}, {parameter_count(model.config):,} parameters, float32"
     facts = {
-        "network": f"Neural Descriptor Fields occupancy network, latent {model.config.latent}, {parameter_count(model.config):,} parameters, float32",
+        "network": f"Neural Descriptor Fields occupancy network, {sizes}",
         "trained by": model.info.source,
         "input": f"a cloud of any density, thinned to {model.info.cloud_points} farthest points (`imitate` does it), any pose",
     }
+    if model.info.description:
+        facts["notes"] = model.info.description
     lines = [f"# {model.info.name}", "", "| what | value |", "|---|---|", *(f"| {what} | {value} |" for what, value in facts.items()), ""]
     lines += ["## Transfer of one pose", "", _told(settings), ""]
     for objects in dict.fromkeys(name for name, _ in outcomes):
@@ -62,8 +65,8 @@ def _told(settings: dict) -> str:
     told = " ".join(f"--{name} {value}" for name, value in options.items())
     return (
         f"One pose at the {settings['place']}, shown on a generated mug of the same height, target in a uniform random pose, best of "
-        f"{settings['inits']} starts by loss (`tdf evaluate {told}`). Success: position and rotation error both within the bounds; in brackets "
-        "the 95 % bootstrap interval over objects."
+        f"{settings['inits']} starts by loss (`tdf evaluate {told}`). Success: position and rotation error both within the "
+        "bounds; in brackets the 95 % bootstrap interval over objects."
     )
 
 
