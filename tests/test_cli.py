@@ -520,7 +520,7 @@ def test_a_model_card_tells_what_the_record_does(evaluation):
     lines = card.splitlines()
     assert lines[0] == "# small" and "| trained by | a test |" in lines
     assert "Generated mugs: 2 mugs that no training run saw, 2 transfers." in lines
-    assert "`tdf evaluate --seed 3 --pairs 2 --inits 2 --iterations 2 --poses 2`" in card
+    assert "`tdf evaluate --seed 3 --pairs 2 --inits 2 --iterations 2 --meshes DIR --poses 2 --clouds full views1 half`" in card
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.count("|") == 10]
     rows = [row for row in rows if row[0] not in ("cloud", "---")]
     assert len(rows) == len(record["rows"]) == 24

@@ -61,8 +61,10 @@ def write(path: Path, text: str) -> None:
 
 
 def _told(settings: dict) -> str:
-    options = {name: settings[name] for name in ("seed", "pairs", "inits", "iterations", "poses")}
-    told = " ".join(f"--{name} {value}" for name, value in options.items())
+    options = {name: settings[name] for name in ("seed", "pairs", "inits", "iterations")}
+    if settings["meshes"] is not None:
+        options |= {"meshes": "DIR", "poses": settings["poses"]}
+    told = " ".join(f"--{name} {value}" for name, value in (options | {"clouds": " ".join(settings["clouds"])}).items())
     return (
         f"One pose at the {settings['place']}, shown on a generated mug of the same height, target in a uniform random pose, best of "
         f"{settings['inits']} starts by loss (`tdf evaluate {told}`). Success: position and rotation error both within the "

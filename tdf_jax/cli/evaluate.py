@@ -64,7 +64,7 @@ def evaluate(
     config = OptimizeConfig(inits=inits, iterations=iterations)
     settings = {
         "weights": weights, "pairs": pairs, "seed": seed, "height": height, "place": place, "inits": inits, "iterations": iterations,
-        "meshes": None if meshes is None else str(meshes), "poses": poses,
+        "meshes": None if meshes is None else str(meshes), "poses": poses, "clouds": clouds,
     }  # fmt: skip
     targets = [] if meshes is None else load_annotated(meshes)
     model = load_model(weights)

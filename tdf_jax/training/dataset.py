@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 import multiprocessing
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -245,7 +246,9 @@ def _mapped(function, tasks, workers):
         yield map(function, tasks)
         return
     context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(workers, context) as pool:
+    # Ctrl-C reaches every process of the terminal: this one answers it, the others would only add their tracebacks.
+    ignore = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
+    with concurrent.futures.ProcessPoolExecutor(workers, context, **ignore) as pool:
         try:
             yield pool.map(function, tasks)
         finally:
