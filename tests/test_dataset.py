@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -245,6 +246,13 @@ def test_empty_folders_bad_meshes_and_mixed_units_are_refused_before_any_work(me
         (meshes / name).unlink()
     trimesh.load_mesh(meshes / "mug1.obj").apply_scale(0.001).export(meshes / "metres.obj")
     with pytest.raises(InputError, match=r"metres\.obj measures 0\.000.* one unit in all files"):
+        quiet_build(scanned_recipe(meshes), tmp_path / "data")
+    assert not (tmp_path / "data").exists()
+
+
+def test_a_missing_library_is_told_once(meshes, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "igl", None)
+    with pytest.raises(InputError, match=r"^tdf dataset: libigl is not installed; expected the extra 'mesh'"):
         quiet_build(scanned_recipe(meshes), tmp_path / "data")
     assert not (tmp_path / "data").exists()
 

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from tdf_jax.errors import InputError
 from tdf_jax.files import replace_file
-from tdf_jax.meshes import MESH_SUFFIXES, file_axes
+from tdf_jax.meshes import MESH_SUFFIXES, file_axes, libigl
 from tdf_jax.training.objects import UNIFORM_SHARE, Labelled, canonical_mesh, generated_mug, scanned_object
 
 MANIFEST = "dataset.json"
@@ -211,6 +211,7 @@ def _check_meshes(recipe, files, progress):
     """Every mesh must load and enclose a volume, and all must be of about one size."""
     if not files:
         return
+    libigl("tdf dataset")
     diagonals, problems = {}, []
     for file in tqdm(files, desc="checking meshes", disable=not progress):
         try:
