@@ -146,7 +146,9 @@ def test_metrics_cut_short_anywhere_are_dropped(tmp_path):
 
 def test_a_run_may_go_on_from_weights(train, whole, tmp_path):
     """It starts where the weights left off, with its frame read out again, not from the beginning."""
+    before = jax.tree.map(np.array, whole[1])
     train(dataclasses.replace(CONFIG, steps=4), tmp_path, initial=whole[1])
+    assert_same(whole[1], before)  # still there, and as they were
     first, finished, fresh = metrics(tmp_path)[0], metrics(whole[0])[-5:], metrics(whole[0])[0]
     assert first["bce"] < (np.mean([row["bce"] for row in finished]) + fresh["bce"]) / 2
     assert first["frame"] < 0.7 * fresh["frame"]

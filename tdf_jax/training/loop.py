@@ -218,7 +218,7 @@ def _start(config, data, optimiser, initial):
         final["kernel"] = final["kernel"] * (0.5 / jnp.sqrt(jnp.mean(latents(network) ** 2)))
         frame = jnp.zeros((config.network.latent, 3))
     else:
-        network = jax.tree.map(jnp.asarray, initial)
+        network = jax.tree.map(jnp.array, initial)  # a copy: the first step takes its arguments over
         frame = _read_outs(np.asarray(latents(network)), centres)
     params = {"network": network, "frame": frame}
     return params, optimiser.init(params)
