@@ -14,7 +14,7 @@ from tdf_jax.errors import InputError
 from tdf_jax.meshes import sample_surface
 
 PIXELS = 160  # across twice the object's radius: 1.3 mm on a real mug
-OCCLUDERS = 100_000  # points that fill the depth buffer: about 8 for every pixel a mug covers from the side
+OCCLUDERS = 100_000  # points that fill the depth buffer; too few leave gaps through which hidden points show
 TOLERANCE = 0.012  # of the diagonal: a point this far behind the nearest one is hidden; thinner than most walls, 2 mm on a real mug
 DISTANCE = 3.0  # diagonals from the object's middle to the camera
 

@@ -271,6 +271,9 @@ def test_other_recipes_and_damaged_files_are_refused(tmp_path):
     (tmp_path / "data" / "dataset.json").write_text("{")
     with pytest.raises(InputError, match=r"dataset.json cannot be read"):
         load(tmp_path / "data")
+    (tmp_path / "data" / "dataset.json").write_text('{"recipe": {"flavour": 1}}')
+    with pytest.raises(InputError, match=r"dataset.json cannot be read .*flavour"):
+        load(tmp_path / "data")
     with pytest.raises(InputError, match=r"has no dataset.json; expected a folder made by tdf dataset"):
         load(tmp_path)
 

@@ -128,6 +128,12 @@ def test_other_settings_are_refused(train, sets, whole, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
 
 
+def test_data_with_too_few_points_are_refused(train, tmp_path):
+    with pytest.raises(InputError, match=r"points is 350, but a camera sees \d+ of an object's 400 surface points"):
+        train(dataclasses.replace(CONFIG, points=350), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_loss_that_is_not_finite_stops_the_run(train, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "summary", lambda parts: {"loss": np.nan, "bce": 0.0, "frame": 0.0, "place": 0.0, "iou": 0.0})
     with pytest.raises(FloatingPointError, match="the loss is nan at step 1; lower the learning rate"):

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from tdf_jax.cli.scores import GENERATED, THRESHOLDS, Outcomes
+from tdf_jax.cli.scores import GENERATED, THRESHOLDS, Outcomes, successes
 from tdf_jax.files import replace_file
 from tdf_jax.model import Model
 from tdf_jax.network import parameter_count
@@ -77,9 +77,4 @@ def _cells(clouds, outcome) -> list[str]:
     cells = [MEANINGS[clouds], outcome.method, "n/a" if row["iou"] is None else f"{row['iou']:.3f}"]
     cells.append(f"{row['position_median_cm']:.2f} / {row['position_p90_cm']:.2f} cm")
     cells.append(f"{row['rotation_median_deg']:.1f} / {row['rotation_p90_deg']:.1f}°")
-    cells.append(str(row["flips"]))
-    for name in THRESHOLDS:
-        interval = row[f"interval_{name}"]
-        words = "" if interval is None else " ({:.0f} to {:.0f})".format(*(100 * x for x in interval))
-        cells.append(f"{100 * row[f'success_{name}']:.0f} %{words}")
-    return cells
+    return [*cells, str(row["flips"]), *successes(row)]

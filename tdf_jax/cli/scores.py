@@ -39,7 +39,12 @@ def _cells(clouds: str, outcome: Outcome) -> list[str]:
     cells = [outcome.method, clouds, "n/a" if row["iou"] is None else f"{row['iou']:.3f}"]
     for name, unit, form in (("position", "cm", "5.2f"), ("position", "diagonals", ".3f"), ("rotation", "deg", "5.1f")):
         cells.append(" / ".join(format(row[f"{name}_{kind}_{unit}"], form) for kind in ("median", "p90")))
-    cells.append(str(row["flips"]))
+    return [*cells, str(row["flips"]), *successes(row)]
+
+
+def successes(row: dict) -> list[str]:
+    """Success rates of a summary with their intervals, one for each of `THRESHOLDS`."""
+    cells = []
     for name in THRESHOLDS:
         interval = row[f"interval_{name}"]
         words = "n/a" if interval is None else "{:.0f} to {:.0f}".format(*(100 * x for x in interval))

@@ -19,7 +19,7 @@ from tdf_jax.meshes import MESH_SUFFIXES, file_axes, libigl
 from tdf_jax.training.objects import UNIFORM_SHARE, Labelled, canonical_mesh, generated_mug, scanned_object
 
 MANIFEST = "dataset.json"
-SHARD = 50  # objects in a file, 12 MB: what a kill can lose is less than half a minute's work
+SHARD = 50  # objects in a file, 9 MB: what a kill can lose
 SPLITS = ("training", "validation")
 VALIDATION_SEED = 1_000_003  # added to the recipe's seed; objects are a function of (seed, index)
 BITS = "inside", "visible"  # fields kept as single bits
@@ -137,7 +137,7 @@ def load(directory: str | Path) -> tuple[DataSet, DataSet]:
     directory = Path(directory)
     if not (directory / MANIFEST).exists():
         raise InputError(f"load(): {directory} has no {MANIFEST}; expected a folder made by tdf dataset")
-    recipe = Recipe(**_read(directory / MANIFEST, lambda file: json.load(file)["recipe"]))
+    recipe = _read(directory / MANIFEST, lambda file: Recipe(**json.load(file)["recipe"]))
     parts = {split: [] for split in SPLITS}
     for name, split, indices in _shards(recipe):
         if not (directory / name).exists():
@@ -180,7 +180,7 @@ def _claimed(directory, manifest):
     """Whether this data set was begun here before; another one is refused."""
     if not (directory / MANIFEST).exists():
         return False
-    old = _read(directory / MANIFEST, json.load)
+    old = _read(directory / MANIFEST, lambda file: dict(json.load(file)))
     changed = [name for name in manifest["recipe"] if old.get("recipe", {}).get(name) != manifest["recipe"][name]]
     changed += ["files"] * (old.get("files") != manifest["files"])
     if changed:

@@ -28,7 +28,7 @@ from tdf_jax.training.record import METRICS, claim, drop_later_metrics, restore,
 
 CORRUPTING = (0.1, 0.6)  # shares of the run
 VALIDATION_BOX, VALIDATION_POSES = 128, 33
-TRANSFERS, TRANSFER = 8, OptimizeConfig(inits=4, iterations=60)  # 8 s on two cores: less than a tenth of the steps between
+TRANSFERS, TRANSFER = 8, OptimizeConfig(inits=4, iterations=60)  # fewer than an evaluation has: for the trend
 TIMED_STEPS = 6
 
 
@@ -57,10 +57,16 @@ def train(
         The network's parameters.
 
     Raises:
-        InputError: the directory holds another run, or cannot be written.
+        InputError: the data have too few points, or the directory holds another run or cannot be written.
         FloatingPointError: the loss is no longer finite.
     """
     directory = Path(directory)
+    seen = int(validation.visible[:, 0].sum(axis=1).min())
+    if min(seen, data.surface.shape[1]) < config.points:
+        raise InputError(
+            f"train(): points is {config.points}, but a camera sees {seen} of an object's {data.surface.shape[1]} surface points; "
+            "expected no more than it sees: lower points, or build the data set with more"
+        )
     claim(directory, dataclasses.asdict(config) | {"data": data.digest(), "initial": _digest(initial)})
     measured = {
         name: validation_pairs(validation, config.points, VALIDATION_BOX, VALIDATION_POSES, one_view)
