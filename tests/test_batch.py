@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from tdf_jax.training import batch, dataset
 from tdf_jax.training.batch import DIAGONALS, PAIR_SPREAD, draw, validation_pairs
@@ -108,6 +109,19 @@ def test_corrupted_clouds_are_partial_sparse_or_noisy(objects):
         off[corruption] = np.array([np.linalg.norm(sample["centres"]) for sample in samples]) / spread
     assert off[0.0].max() < 0.06
     assert 0.1 < np.mean(off[1.0] > 0.07) < 0.6
+
+
+def test_some_clouds_have_points_astray(objects, monkeypatch):
+    for share in ("PARTIAL_SHARE", "SPARSE_SHARE", "NOISY_SHARE"):
+        monkeypatch.setattr(batch, share, 0.0)
+    monkeypatch.setattr(batch, "OUTLIERS", 0.05)  # of 1000 points: enough to be told by their distance
+    astray = {}
+    for corruption in (0.0, 1.0):
+        clouds = [batch._sensed(objects, np.random.default_rng(seed), 0, corruption, 200) for seed in range(30)]
+        astray[corruption] = [np.sum(cKDTree(objects.surface[0]).query(cloud)[0] > 0.01) for cloud in clouds]
+    assert not np.any(astray[0.0])
+    assert 0.05 < np.mean(np.array(astray[1.0]) > 2) < 0.4
+    assert np.max(astray[1.0]) <= 50
 
 
 def test_validation_pairs_show_every_object_once_at_one_size(objects):

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from tdf_jax.pointcloud import thin
 from tdf_jax.training.dataset import DataSet
+from tdf_jax.training.objects import BOX_PADDING
 
 DIAGONALS = (0.08, 0.5)  # metres; every draw rescales its pair to a diagonal log-uniform in this range
 USUAL_DIAGONALS = (0.12, 0.25)  # or, half of the time, in this one, a real mug's
@@ -23,6 +24,8 @@ SPARSE_SHARE = 0.3  # of the clouds: of `SPARSE_CLOUDS` points before thinning, 
 SPARSE_CLOUDS = (300, DENSE)
 NOISY_SHARE = 0.3  # of the clouds: normal noise with a standard deviation of up to `NOISE` of the diagonal, 2.5 mm on a real mug
 NOISE = 0.015
+OUTLIER_SHARE = 0.2  # of the clouds: some points anywhere in the padded box
+OUTLIERS = 0.005  # of the points, at most; thinning by farthest points keeps nearly all: up to 4 % of a thinned cloud
 
 # Boxes of query points, shown at a place of one object of a pair and offered to the other at the same place and at wrong poses.
 FIRST_SHARE = 0.6  # of the boxes at the first place of an object, a mug's handle; the others share the rest
@@ -100,6 +103,10 @@ def _sensed(data, rng, index, corruption, points):
     cloud = rng.permutation(surface)[: max(points, count)]
     if rng.uniform() < NOISY_SHARE * corruption:
         cloud = cloud + rng.normal(size=cloud.shape) * rng.uniform(0, NOISE)
+    if rng.uniform() < OUTLIER_SHARE * corruption:
+        low, high = surface.min(axis=0) - BOX_PADDING, surface.max(axis=0) + BOX_PADDING
+        astray = rng.choice(len(cloud), int(len(cloud) * rng.uniform(0, OUTLIERS)), replace=False)
+        cloud[astray] = rng.uniform(low, high, (len(astray), 3))
     return cloud
 
 

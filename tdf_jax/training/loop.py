@@ -30,6 +30,7 @@ CORRUPTING = (0.1, 0.6)  # shares of the run
 VALIDATION_BOX, VALIDATION_POSES = 128, 33
 TRANSFERS, TRANSFER = 8, OptimizeConfig(inits=4, iterations=60)  # fewer than an evaluation has: for the trend
 TIMED_STEPS = 6
+AVERAGED = 0.1  # the weights a run gives are averaged over about this share of its steps, the latest
 
 
 def train(
@@ -54,7 +55,8 @@ def train(
         progress: show a progress bar.
 
     Returns:
-        The network's parameters.
+        The network's parameters, averaged over about the last tenth of the steps, as validation measures them: at a high learning rate
+        they are far better than the latest, so a run's state is of use at any time.
 
     Raises:
         InputError: the data have too few points, or the directory holds another run or cannot be written.
@@ -83,13 +85,13 @@ def train(
         bar = tqdm(range(start, config.steps), initial=start, total=config.steps, desc="training", disable=not progress)
         for step in bar:
             samples, upcoming = upcoming.result(), pool.submit(_batch, config, data, step + 1)
-            params, state, parts = _step(params, state, dataclasses.astuple(samples), config.network, optimiser)
+            params, state, parts = _step(params, state, dataclasses.astuple(samples), step, config.network, optimiser)
             row = {"step": step + 1, "seconds": round(time.monotonic() - began, 2)} | summary(parts)
             bar.set_postfix({name: f"{row[name]:.3f}" for name in ("bce", "frame", "place", "iou")})
             done = step + 1 == config.steps
             if done or (step + 1) % config.validate_every == 0:
-                row |= {name: validate(params, config, pairs) for name, pairs in measured.items()}
-                row["transfer"] = transfer_errors(params, config, transfers)
+                row |= {name: validate(state["average"], config, pairs) for name, pairs in measured.items()}
+                row["transfer"] = transfer_errors(state["average"], config, transfers)
             metrics.write(json.dumps(row) + "\n")
             metrics.flush()
             if not np.isfinite(row["loss"]):
@@ -97,7 +99,7 @@ def train(
             if done or time.monotonic() - saved > config.save_seconds:
                 save(directory, params, state, step + 1)
                 saved = time.monotonic()
-    return params["network"]
+    return state["average"]["network"]
 
 
 def steps_within(minutes: float, config: TrainConfig, data: DataSet) -> int:
@@ -115,7 +117,7 @@ def steps_within(minutes: float, config: TrainConfig, data: DataSet) -> int:
     times = []
     for step in range(TIMED_STEPS):
         began = time.monotonic()
-        params, state, _ = _step(params, state, dataclasses.astuple(_batch(config, data, step)), config.network, optimiser)
+        params, state, _ = _step(params, state, dataclasses.astuple(_batch(config, data, step)), step, config.network, optimiser)
         jax.block_until_ready(params)
         times.append(time.monotonic() - began)
     seconds = float(np.median(times[1:]))  # the first compiles
@@ -182,10 +184,14 @@ def summary(parts: dict) -> dict:
 
 
 @functools.partial(jax.jit, static_argnames=("config", "optimiser"), donate_argnums=(0, 1))
-def _step(params, state, samples, config, optimiser):
+def _step(params, state, samples, step, config, optimiser):
     gradient, parts = mean_gradient(params, config, *samples)
-    updates, state = optimiser.update(gradient, state, params)
-    return optax.apply_updates(params, updates), state, parts
+    updates, optimisation = optimiser.update(gradient, state["optimiser"], params)
+    params = optax.apply_updates(params, updates)
+    # The weight of the latest falls as 1/step, so the average reaches back over a share of the run, not over a number of steps.
+    rate = 1 / (1 + AVERAGED * step)
+    average = optax.incremental_update(params, state["average"], rate)
+    return params, {"optimiser": optimisation, "average": average}, parts
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -227,7 +233,7 @@ def _start(config, data, optimiser, initial):
         network = jax.tree.map(jnp.array, initial)  # a copy: the first step takes its arguments over
         frame = _read_outs(np.asarray(latents(network)), centres)
     params = {"network": network, "frame": frame}
-    return params, optimiser.init(params)
+    return params, {"optimiser": optimiser.init(params), "average": jax.tree.map(jnp.copy, params)}
 
 
 def _read_outs(latents, centres):
