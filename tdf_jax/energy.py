@@ -18,11 +18,12 @@ from tdf_jax.errors import InputError
 from tdf_jax.field import DescriptorField
 from tdf_jax.trajectory import Trajectory
 
-POSE_NORMS = ("frobenius", "metres_radians")
+POSE_NORMS = ("frobenius", "metres_radians", "mean_absolute")
+COMPENSATOR_ORDERS = ("frobenius", "infinity")
 
 
 @functools.partial(
-    jax.tree_util.register_dataclass, data_fields=["correlation", "compensator", "lever"], meta_fields=["pose_norm"]
+    jax.tree_util.register_dataclass, data_fields=["correlation", "compensator", "lever"], meta_fields=["pose_norm", "compensator_order"]
 )
 @dataclasses.dataclass(frozen=True)
 class EnergyWeights:
@@ -35,20 +36,23 @@ class EnergyWeights:
             about one unit in size; at 1 m, a turn outweighs the descriptors of a real, 0.1 m mug by far, and a mug that lies
             in another orientation is not followed (measured in docs/energy.md). 1.0 gives the plain norm.
         pose_norm: the norm of eq. 3, which the paper does not specify: "frobenius", of the difference of the 4x4 matrices,
-            or "metres_radians", sqrt(distance^2 + angle^2).
+            "metres_radians", sqrt(distance^2 + angle^2), or "mean_absolute", over the twelve numbers of (R, t), as eq. 2 is over channels.
+        compensator_order: of eq. 6, see `compensator_loss`.
 
     Raises:
-        InputError: a negative weight or an unknown norm.
+        InputError: a negative weight, or an unknown norm or order.
     """
 
     correlation: Float[Array, ""] | float = 0.02
     compensator: Float[Array, ""] | float = 0.0
     lever: Float[Array, ""] | float = 0.05
     pose_norm: str = "frobenius"
+    compensator_order: str = "frobenius"
 
     def __post_init__(self):
-        if self.pose_norm not in POSE_NORMS:
-            raise InputError(f"EnergyWeights(): pose_norm is {self.pose_norm!r}; expected one of {', '.join(POSE_NORMS)}")
+        for name, known in (("pose_norm", POSE_NORMS), ("compensator_order", COMPENSATOR_ORDERS)):
+            if getattr(self, name) not in known:
+                raise InputError(f"EnergyWeights(): {name} is {getattr(self, name)!r}; expected one of {', '.join(known)}")
         for name in ("correlation", "compensator", "lever"):
             value = getattr(self, name)
             if isinstance(value, int | float | np.number) and not 0 <= value < np.inf:
@@ -112,7 +116,7 @@ def pose_energy(
         weights: of the terms.
     """
     correlation = _correlation(R, t, origin, reference, weights.lever, weights.pose_norm)
-    return weights.correlation * correlation + weights.compensator * jnp.sum(_step_lengths(R, t))
+    return weights.correlation * correlation + weights.compensator * _compensator(R, t, weights.compensator_order)
 
 
 def correlation_loss(
@@ -145,10 +149,9 @@ def compensator_loss(trajectory: Trajectory, order: str = "frobenius") -> Float[
     Raises:
         InputError: an unknown order.
     """
-    if order not in ("frobenius", "infinity"):
+    if order not in COMPENSATOR_ORDERS:
         raise InputError(f"compensator_loss(): order is {order!r}; expected 'frobenius' or 'infinity'")
-    lengths = _step_lengths(trajectory.rotations, trajectory.translations)
-    return jnp.max(lengths) if order == "infinity" else jnp.sum(lengths)
+    return _compensator(trajectory.rotations, trajectory.translations, order)
 
 
 def _correlation(R, t, origin, reference, lever, pose_norm):
@@ -158,17 +161,19 @@ def _correlation(R, t, origin, reference, lever, pose_norm):
         turn = poses.rotation_distance(R, target.rotations)[:, None]
     else:
         turn = (R - target.rotations).reshape(-1, 9)
-    return jnp.mean(_norm(jnp.concatenate([shift, lever * turn], axis=-1)))
+    difference = jnp.concatenate([shift, lever * turn], axis=-1)
+    return jnp.mean(_norm(difference[..., None] if pose_norm == "mean_absolute" else difference))
 
 
-def _step_lengths(R, t):
-    """||T_i^-1 T_{i+1} - I||_F of neighbouring poses; a rotation more on both sides does not change it."""
+def _compensator(R, t, order):
+    # ||T_i^-1 T_{i+1} - I||_F of neighbouring poses: a rotation more on both sides does not change it.
     turn = (R[1:] - R[:-1]).reshape(-1, 9)
-    return _norm(jnp.concatenate([t[1:] - t[:-1], turn], axis=-1))
+    lengths = _norm(jnp.concatenate([t[1:] - t[:-1], turn], axis=-1))
+    return jnp.max(lengths) if order == "infinity" else jnp.sum(lengths)
 
 
 def _norm(x):
-    """Euclidean norm over the last axis, with gradient zero at zero: a fixed last pose is often exactly the reference's."""
+    """Euclidean norm over the last axis, with gradient zero at zero (that of `jnp.abs` is 1): a fixed last pose is often exactly the reference's."""
     squared = jnp.sum(x * x, axis=-1)
     zero = squared == 0
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))

@@ -137,6 +137,26 @@ def test_equation_3_is_the_mean_distance_of_centred_poses(settings, turn):
     np.testing.assert_allclose(tdf.correlation_loss(found, origin, reference, **settings), expected, rtol=1e-6)
 
 
+def test_the_mean_absolute_norm_is_over_the_twelve_numbers_of_a_pose():
+    reference = coordinates_reference([(0, 0, 0)], (IDENTITY, (0, 0, 0)), (IDENTITY, (0, 1, 0)))
+    # Pose 0: off by (3, -4, 0). Pose 1: a quarter turn, four entries of 1.
+    found = trajectory((IDENTITY, (4, -2, 3)), (QUARTER_TURN_Z, (1, 3, 3)))
+    loss = tdf.correlation_loss(found, Coordinates.origin, reference, lever=0.5, pose_norm="mean_absolute")
+    np.testing.assert_allclose(loss, (7 / 12 + 2 / 12) / 2, rtol=1e-6)
+
+
+def test_the_energy_takes_either_order_of_equation_6(field, reference, current):
+    found = {}
+    for order in ("frobenius", "infinity"):
+        weights = tdf.EnergyWeights(0.0, 0.3, compensator_order=order)
+        rest = tdf.trajectory_energy(current, field, reference, weights) - tdf.descriptor_loss(current, field, reference)
+        np.testing.assert_allclose(rest, 0.3 * tdf.compensator_loss(current, order), rtol=1e-4)
+        found[order] = float(rest)
+    assert found["infinity"] < found["frobenius"]
+    with pytest.raises(InputError, match="compensator_order is 'largest'"):
+        tdf.EnergyWeights(compensator_order="largest")
+
+
 def test_the_plain_norm_of_equation_3_is_that_of_the_matrices():
     found, target = (tdf.Trajectory(jnp.asarray(random_poses(seed, 5), jnp.float32)) for seed in (0, 1))
     reference = Reference(jnp.zeros((5, 1, 3)), target, jnp.zeros((1, 3)))

@@ -8,7 +8,8 @@ import tdf_jax as tdf
 from tdf_jax.errors import InputError
 from tdf_jax.shapes import build_mug
 from tdf_jax.viz import solid
-from tdf_jax.viz.plots import imitation_figure, loss_figure, save_figure
+from tdf_jax.viz.plots import imitation_figure, loss_figure
+from tdf_jax.viz.style import save_figure
 
 
 @pytest.fixture(scope="module")

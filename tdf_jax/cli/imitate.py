@@ -14,10 +14,11 @@ from tqdm import tqdm
 
 from tdf_jax.checkpoint import load_model
 from tdf_jax.cli import report
-from tdf_jax.cli.scene import Scene, make_scene
+from tdf_jax.cli.scene import make_scene
 from tdf_jax.cli.settings import Settings, resolved
 from tdf_jax.demonstration import describe
 from tdf_jax.energy import EnergyWeights
+from tdf_jax.evaluation.scene import Scene
 from tdf_jax.files import replace_file, replace_folder
 from tdf_jax.imitation import imitate as imitate_scene
 from tdf_jax.optimize import OptimizeConfig, Result
@@ -75,7 +76,8 @@ def _run(settings: Settings, folder: Path) -> dict:
 
 
 def _draw(folder: Path, scene: Scene, result: Result) -> None:
-    from tdf_jax.viz.plots import imitation_figure, loss_figure, save_figure
+    from tdf_jax.viz.plots import imitation_figure, loss_figure
+    from tdf_jax.viz.style import save_figure
 
     trajectory = result.trajectory
     expected = scene.expected(trajectory.wxyz_xyz[-1])

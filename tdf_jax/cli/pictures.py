@@ -11,7 +11,7 @@ from tdf_jax.errors import InputError
 from tdf_jax.evaluation.comparison import Outcome
 from tdf_jax.evaluation.transfer import QUERY_SIZE
 from tdf_jax.model import Model, encode
-from tdf_jax.viz.plots import save_figure
+from tdf_jax.viz.style import save_figure
 from tdf_jax.viz.reconstruction import Panel, reconstructed, reconstruction_figure, transfer_figure
 
 NAMES = ("reconstructions.png", "transfers.png")

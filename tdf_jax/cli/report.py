@@ -7,9 +7,9 @@ import jax
 import numpy as np
 
 import tdf_jax
-from tdf_jax.cli.scene import Scene
 from tdf_jax.cli.settings import Settings
 from tdf_jax.energy import EnergyWeights
+from tdf_jax.evaluation.scene import Scene
 from tdf_jax.evaluation.truth import path_error, pose_error
 from tdf_jax.model import Model
 from tdf_jax.optimize import OptimizeConfig, Result

@@ -1,55 +1,26 @@
 """What `tdf imitate` works on: a demonstration and a target, from the user's files or a pair of generated mugs."""
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from tdf_jax.cli.settings import Settings
 from tdf_jax.demonstration import Demonstration
 from tdf_jax.errors import InputError
 from tdf_jax.evaluation.cases import Case, mug_case, random_pose
-from tdf_jax.evaluation.truth import expected_trajectory
+from tdf_jax.evaluation.scene import Scene
 from tdf_jax.meshes import load_mesh
 from tdf_jax.pointcloud import load_points
 from tdf_jax.query import box_query
 from tdf_jax.recording import load_demonstration
-from tdf_jax.trajectory import Trajectory, line, resample, semicircle, wave
-
-if TYPE_CHECKING:
-    import trimesh
+from tdf_jax.trajectory import line, resample, semicircle, wave
 
 SHAPES = {"line": line, "semicircle": semicircle, "wave": wave}
 MUG_HEIGHT = 0.12  # metres
 QUERY_SIZE = 0.06  # metres, edge of the box of query points about the handle
 PLACE = (0.0, 0.24, 0.18)  # metres from the pick: 0.30 m away, to the handle's side and up
 LIFT = (0.0, 0.0, 1.0)  # a semicircle and a wave leave the straight line upwards first
-
-
-@dataclasses.dataclass(frozen=True)
-class Scene:
-    """A demonstration, and the object to imitate it on.
-
-    Attributes:
-        demonstration: as given or generated.
-        points: the target's cloud, (points, 3), metres, world frame.
-        T_world_target: how the file's frame, or the generated mug's, lies in the world, 4x4.
-        T_world_handles: frames of the handle on both objects, 4x4; None unless both are generated.
-        meshes: of both objects, world frame, where they have one.
-    """
-
-    demonstration: Demonstration
-    points: Float[np.ndarray, "points 3"]
-    T_world_target: Float[np.ndarray, "4 4"]
-    T_world_handles: tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"]] | None
-    meshes: "tuple[trimesh.Trimesh | None, trimesh.Trimesh | None]"
-
-    def expected(self, goal: Float[Array, "7"]) -> Trajectory | None:
-        """The true trajectory on the target for a goal; None where it is not known."""
-        if self.T_world_handles is None:
-            return None
-        return expected_trajectory(self.demonstration.trajectory, *self.T_world_handles, goal)
 
 
 def make_scene(settings: Settings, key: PRNGKeyArray) -> Scene:

@@ -41,7 +41,7 @@ def train(
         config: settings of the run.
     """
     from tdf_jax.viz.curves import training_figure
-    from tdf_jax.viz.plots import save_figure
+    from tdf_jax.viz.style import save_figure
 
     target = _target(out, weights)
     if minutes is not None and not 0 < minutes < float("inf"):

@@ -58,3 +58,17 @@ def pose_error(found: Float[Array, "... 7"], truth: Float[Array, "... 7"]) -> tu
 def path_error(found: Trajectory, truth: Trajectory) -> float:
     """Mean distance of waypoints, metres."""
     return float(np.mean(pose_error(found.wxyz_xyz, truth.wxyz_xyz)[0]))
+
+
+def shape_error(found: Float[np.ndarray, "poses 3"], truth: Float[np.ndarray, "poses 3"]) -> float:
+    """How far a path has another shape: root mean square distance of waypoints after the best rigid motion onto the truth, metres.
+
+    Args:
+        found, truth: translations of the waypoints, metres.
+    """
+    found, truth = (np.asarray(path, float) - np.mean(path, axis=0, dtype=float) for path in (found, truth))
+    left, values, right = np.linalg.svd(found.T @ truth)
+    # Proper rotations only: a wave is not its mirror image.
+    values[-1] *= np.sign(np.linalg.det(left @ right))
+    squared = np.sum(found**2) + np.sum(truth**2) - 2 * np.sum(values)
+    return float(np.sqrt(max(squared, 0.0) / len(found)))

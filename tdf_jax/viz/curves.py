@@ -6,7 +6,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from tdf_jax.viz.plots import INK, STYLE, TRUTH
+from tdf_jax.viz.style import INK, STYLE, TRUTH
 
 PANELS = (
     ("bce", "occupancy: binary cross-entropy", "log"),

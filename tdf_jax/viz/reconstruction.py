@@ -15,7 +15,7 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 from tdf_jax.field import DescriptorField
 from tdf_jax.meshes import libigl
 from tdf_jax.viz import solid
-from tdf_jax.viz.plots import CENTIMETRES, INK, LIGHT, STYLE, TRUTH
+from tdf_jax.viz.style import CENTIMETRES, INK, LIGHT, STYLE, TRUTH
 
 FOUND = "#2a6f97"
 VIEW = {"elev": 28, "azim": -55}  # into the cup, its handle to the right

@@ -1,0 +1,120 @@
+"""`tdf reproduce`: the paper's table and figures."""
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tqdm import tqdm
+
+from tdf_jax.checkpoint import load_model
+from tdf_jax.errors import InputError
+from tdf_jax.experiments import figures, landscapes, table
+from tdf_jax.experiments.run import Run
+from tdf_jax.experiments.setting import Setting, scene
+from tdf_jax.experiments.store import Store
+from tdf_jax.files import replace_file
+
+EXPERIMENTS = ("table1", "fig1", "fig2", "fig3", "fig4", "fig5")
+RUNS = "runs"  # folder of what was computed
+GRID, FAST_GRID = 101, 31
+FAST = {"inits": 1, "iterations": 40, "queries": 24}
+
+
+def reproduce(
+    experiment: Annotated[Literal["table1", "fig1", "fig2", "fig3", "fig4", "fig5", "all"], tyro.conf.Positional],
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("reproduction"),
+    fast: bool = False,
+    weights: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "mug",
+    setting: Annotated[Setting, tyro.conf.arg(name="")] = Setting(),
+) -> None:
+    """Regenerate the paper's table and figures with mugs of the library's own; docs/paper.md explains every number.
+
+    Interrupted and run again, it does only what is missing.
+
+    Args:
+        experiment: which one.
+        out: folder for the pictures and tables; what was computed is kept in its folder runs.
+        fast: fewer starts, iterations, query points, seeds and grid points: a look at everything in minutes.
+        weights: a name of shipped weights, or a .safetensors file.
+        setting: what all experiments start from; each changes what it is about.
+    """
+    if fast:
+        setting = dataclasses.replace(setting, **FAST)
+    try:
+        (out / RUNS).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"tdf reproduce: cannot make the folder {out} ({error}); expected a writable place") from None
+    store = Store(load_model(weights), out / RUNS)
+    for name in EXPERIMENTS if experiment == "all" else (experiment,):
+        for path in _COMMANDS[name](store, setting, fast, out):
+            print(f"saved {path}")
+
+
+def _table1(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
+    plan = table.planned(base, 1, table.FAST_VARIATIONS) if fast else table.planned(base)
+    settings = [setting for *_, chosen in plan for setting in chosen]
+    _run_all(store, settings, "table 1")
+    rows = table.rows(store.run, plan)
+    yield _text(out / "table1.md", table.as_markdown(rows))
+    yield _text(out / "table1.csv", table.as_csv(rows))
+
+
+def _fig1(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
+    from tdf_jax.experiments import pictures
+
+    settings = figures.figure1(base)
+    yield _picture(out / "fig1.png", pictures.figure1(_run_all(store, settings, "figure 1"), scene(settings["l_t"])))
+
+
+def _fig2(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
+    from tdf_jax.experiments import pictures
+
+    count = FAST_GRID if fast else GRID
+    fields = {name: store.landscapes(base, name, count) for name in tqdm(landscapes.FIELDS, desc="figure 2", unit="field")}
+    yield _picture(out / "fig2.png", pictures.figure2({"test mug": fields["test mug"]}))
+    yield _picture(out / "fig2_mugs_and_poses.png", pictures.figure2(fields))
+
+
+def _fig3(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
+    from tdf_jax.experiments import pictures
+
+    settings = figures.figure3(base, (0.25, *figures.PAPER_DISTANCES), 1) if fast else figures.figure3(base)
+    yield _picture(out / "fig3.png", pictures.figure3(_run_all(store, settings, "figure 3")))
+
+
+def _fig4(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
+    from tdf_jax.experiments import pictures
+
+    settings = figures.figure4(base)
+    runs = _run_all(store, settings, "figure 4")
+    yield _picture(out / "fig4.png", pictures.figure4(runs, {name: scene(setting) for name, setting in settings.items()}))
+    yield _picture(out / "fig4_turn.png", pictures.figure4_turn(runs))
+
+
+def _fig5(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
+    from tdf_jax.experiments import pictures
+
+    yield _picture(out / "fig5.png", pictures.figure5(_run_all(store, figures.figure5(base), "figure 5")))
+
+
+_COMMANDS: dict[str, Callable] = dict(zip(EXPERIMENTS, (_table1, _fig1, _fig2, _fig3, _fig4, _fig5)))
+
+
+def _run_all(store: Store, settings, words: str) -> dict[object, Run]:
+    """Runs of settings, with a progress bar: a mapping's by its names, a sequence's by their number."""
+    named = settings if isinstance(settings, dict) else dict(enumerate(settings))
+    return {name: store.run(setting) for name, setting in tqdm(named.items(), desc=words, unit="run")}
+
+
+def _picture(path: Path, figure) -> Path:
+    from tdf_jax.viz.style import save_figure
+
+    save_figure(path, figure)
+    return path
+
+
+def _text(path: Path, content: str) -> Path:
+    replace_file("tdf reproduce", path, content.encode())
+    return path

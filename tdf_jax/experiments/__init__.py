@@ -1,0 +1,1 @@
+"""The paper's table and figures, as functions that return data; `pictures` draws them."""

@@ -1,0 +1,127 @@
+"""One imitation of the paper: run, and measured against the truth."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from tdf_jax.demonstration import describe, thinned
+from tdf_jax.energy import descriptor_loss, trajectory_energy
+from tdf_jax.evaluation.truth import pose_error, shape_error
+from tdf_jax.experiments import setting as settings
+from tdf_jax.experiments.setting import Setting
+from tdf_jax.model import Model, encode
+from tdf_jax.optimize import optimize
+
+SETTLED = 0.95  # of the loss's drop
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What became of one setting; poses are `wxyz_xyz`, T_world_query.
+
+    Attributes:
+        reference: the demonstration.
+        expected: the true trajectory on the test mug.
+        starts, found: of every start, before and after.
+        losses: energy of every start before each iteration, and after the last.
+        descriptor: l_t alone, of the best start's trajectory and of the true one.
+        expected_energy: energy of the true trajectory.
+        origin: centroid of the test mug's cloud, metres.
+    """
+
+    reference: Float[np.ndarray, "poses 7"]
+    expected: Float[np.ndarray, "poses 7"]
+    starts: Float[np.ndarray, "inits poses 7"]
+    found: Float[np.ndarray, "inits poses 7"]
+    losses: Float[np.ndarray, "inits iterations_and_1"]
+    descriptor: Float[np.ndarray, "2"]
+    expected_energy: Float[np.ndarray, ""]
+    origin: Float[np.ndarray, "3"]
+
+    @property
+    def best(self) -> int:
+        """The start with the least energy at the end."""
+        return int(np.nanargmin(self.losses[:, -1]))
+
+    @property
+    def trajectory(self) -> Float[np.ndarray, "poses 7"]:
+        """What the best start came to."""
+        return self.found[self.best]
+
+    @property
+    def loss(self) -> float:
+        """Energy of the best start at the end."""
+        return float(self.losses[self.best, -1])
+
+    @property
+    def start_loss(self) -> float:
+        """Energy of the best start before the first iteration."""
+        return float(self.losses[self.best, 0])
+
+    @property
+    def settled(self) -> int:
+        """Iterations after which the best start's loss has made `SETTLED` of its drop, for good."""
+        curve = self.losses[self.best]
+        limit = curve[0] - SETTLED * (curve[0] - curve[-1])
+        above = np.flatnonzero(curve > limit)
+        return int(above[-1]) + 1 if len(above) else 0
+
+    @property
+    def pick_error(self) -> tuple[float, float]:
+        """Distance, metres, and angle, radians, of the first pose from the true one."""
+        distance, angle = pose_error(self.trajectory[0], self.expected[0])
+        return float(distance), float(angle)
+
+    @property
+    def waypoint_error(self) -> tuple[float, float]:
+        """Mean distance, metres, and angle, radians, of the poses from the true ones."""
+        distance, angle = pose_error(self.trajectory, self.expected)
+        return float(distance.mean()), float(angle.mean())
+
+    @property
+    def shape_error(self) -> float:
+        """See `tdf_jax.evaluation.truth.shape_error`, metres."""
+        return shape_error(self.trajectory[:, 4:], self.expected[:, 4:])
+
+    @property
+    def longest_step(self) -> float:
+        """Largest distance of neighbouring poses over their mean distance; the demonstration's is 1 where it is evenly spaced."""
+        steps = np.linalg.norm(np.diff(self.trajectory[:, 4:], axis=0), axis=1)
+        return float(steps.max() / steps.mean())
+
+
+def imitation(model: Model, setting: Setting) -> Run:
+    """Imitate once.
+
+    Args:
+        model: the network.
+        setting: all of its numbers.
+    """
+    scene = settings.scene(setting)
+    reference = describe(model, scene.demonstration)
+    field = encode(model, thinned(model, scene.points))
+    goal = settings.goal(setting, field, reference)
+    key = jax.random.fold_in(jax.random.key(setting.seed), settings.STREAM + 1)
+    result = optimize(
+        field, reference, key, goal=goal, fix_last=setting.fix_last, energy=setting.energy, config=setting.optimiser
+    )
+    expected = scene.expected(goal)
+    found = result.trajectory
+    weights = jax.tree.map(lambda weight: jnp.asarray(weight, jnp.float32), setting.energy)
+    return Run(
+        reference=np.asarray(scene.demonstration.trajectory.wxyz_xyz),
+        expected=np.asarray(expected.wxyz_xyz),
+        starts=np.asarray(result.starts),
+        found=np.asarray(result.trajectories),
+        losses=np.column_stack([result.losses, result.energies]),
+        descriptor=np.array([_descriptor_loss(one, field, reference) for one in (found, expected)]),
+        expected_energy=np.asarray(_energy(expected, field, reference, weights)),
+        origin=np.asarray(field.origin),
+    )
+
+
+_descriptor_loss = jax.jit(descriptor_loss)
+_energy = jax.jit(trajectory_energy)
