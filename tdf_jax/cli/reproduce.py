@@ -41,12 +41,14 @@ def reproduce(
         setting: what all experiments start from; each changes what it is about.
     """
     if fast:
-        setting = dataclasses.replace(setting, **FAST)
+        untouched = {name: value for name, value in FAST.items() if getattr(setting, name) == getattr(Setting(), name)}
+        setting = dataclasses.replace(setting, **untouched)
+    model = load_model(weights)
     try:
         (out / RUNS).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"tdf reproduce: cannot make the folder {out} ({error}); expected a writable place") from None
-    store = Store(load_model(weights), out / RUNS)
+    store = Store(model, out / RUNS)
     for name in EXPERIMENTS if experiment == "all" else (experiment,):
         for path in _COMMANDS[name](store, setting, fast, out):
             print(f"saved {path}")

@@ -48,12 +48,12 @@ class Setting:
         query_size: edge of the cube, or standard deviation, metres; none: 0.1 and 0.025.
         queries: number of query points.
         start: see `tdf_jax.OptimizeConfig`.
-        translation_rate: Adam's first step size for translations, metres; the rates fall as a cosine, so a pose can travel about half of
-            `iterations` times as far. The default 0.01 m of `tdf_jax.OptimizeConfig` is for a path of 0.3 m.
+        translation_rate: Adam's first step size for translations, metres; a pose travels at most half of `iterations` times as far. The
+            0.01 m of `tdf_jax.OptimizeConfig` are for a path of 0.3 m.
         inits: random starts; the one with the least energy counts.
         diagonal: of both mugs, metres.
         unit: metres the paper's unit is.
-        turn: of the test mug, degrees, about a random axis; none: any rotation.
+        turn: of the test mug, degrees, about a random axis; "any" is a uniform rotation.
         seed: which mugs, axis, clouds, query points and starts.
     """
 
@@ -77,7 +77,7 @@ class Setting:
     inits: int = 4
     diagonal: float = 0.3
     unit: float = 1.0
-    turn: float | None = 60.0
+    turn: float | Literal["any"] = 60.0
     seed: int = 0
 
     def __post_init__(self):
@@ -96,8 +96,8 @@ class Setting:
         for name in ("k", "lever", "compensator"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise InputError(f"Setting(): {name} is {getattr(self, name)}; expected a number of 0 or more")
-        if self.turn is not None and not 0 <= self.turn <= 180:
-            raise InputError(f"Setting(): turn is {self.turn}; expected 0 to 180 degrees")
+        if self.turn != "any" and not 0 <= self.turn <= 180:
+            raise InputError(f"Setting(): turn is {self.turn}; expected 0 to 180 degrees, or 'any'")
         if len(self.displacement) != 3 or not np.isfinite(self.displacement).all():
             raise InputError(f"Setting(): displacement is {self.displacement}; expected three finite numbers")
 
@@ -139,7 +139,7 @@ def rotation(setting: Setting) -> Float[np.ndarray, "3 3"]:
     from scipy.spatial.transform import Rotation
 
     rng = np.random.default_rng([STREAM, setting.seed, 0])
-    if setting.turn is None:
+    if setting.turn == "any":
         return Rotation.random(random_state=rng).as_matrix()
     axis = rng.normal(size=3)
     return Rotation.from_rotvec(np.radians(setting.turn) * axis / np.linalg.norm(axis)).as_matrix()

@@ -52,7 +52,7 @@ VARIATIONS: dict[str, dict] = {
     "objects of 0.2 m": {"diagonal": 0.2},
     "objects of one unit (0.3 m)": {"unit": 0.3},
     "test mug as the reference lies": {"turn": 0.0},
-    "test mug in any orientation": {"turn": None},
+    "test mug in any orientation": {"turn": "any"},
 }
 FAST_VARIATIONS = ("as in the rows above", "k = 0", "k = 0.2", "l_p for l_c, infinity", "n = 3", "last pose free")
 
