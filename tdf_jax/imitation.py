@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from tdf_jax.demonstration import Demonstration, Reference, describe, thinned
 from tdf_jax.energy import EnergyWeights
 from tdf_jax.errors import InputError
+from tdf_jax.keys import check_key
 from tdf_jax.model import Model, encode
 from tdf_jax.optimize import OptimizeConfig, Result, default_goal, optimize
 
@@ -48,6 +49,7 @@ def imitate(
     Raises:
         InputError: bad points, goal or offset.
     """
+    check_key("imitate()", key)
     reference = demonstration if isinstance(demonstration, Reference) else describe(model, demonstration)
     field = encode(model, thinned(model, points))
     goal = default_goal(field, reference) if goal is None else _finite("goal", goal, (7,))
@@ -83,6 +85,7 @@ def imitate_batch(
     Raises:
         InputError: no clouds, or as for `imitate`.
     """
+    check_key("imitate_batch()", key)
     clouds = list(clouds)
     if not clouds:
         raise InputError("imitate_batch(): there are no clouds; expected at least one")

@@ -20,6 +20,7 @@ from tdf_jax.demonstration import Reference
 from tdf_jax.energy import EnergyWeights, pose_energy, waypoint_loss
 from tdf_jax.errors import InputError
 from tdf_jax.field import DescriptorField
+from tdf_jax.keys import check_key
 from tdf_jax.trajectory import Trajectory, check_trajectory
 
 STARTS = ("carried", "scattered")
@@ -166,6 +167,7 @@ def optimize(
             "expected both from the same model"
         )
     if starts is None:
+        check_key("optimize()", key)
         goal = default_goal(field, reference) if goal is None else goal
         starts = random_starts(key, field, reference, config.inits, config.start, config.start_radius)
     if goal is not None:

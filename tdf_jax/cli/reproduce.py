@@ -19,7 +19,7 @@ from tdf_jax.files import replace_file
 EXPERIMENTS = ("table1", "fig1", "fig2", "fig3", "fig4", "fig5")
 RUNS = "runs"  # folder of what was computed
 GRID, FAST_GRID = 101, 31
-FAST = {"inits": 1, "iterations": 40, "queries": 24}
+FAST = {"inits": 2, "iterations": 60, "queries": 24}
 
 
 def reproduce(

@@ -154,7 +154,7 @@ def figure2(fields: dict[str, dict[str, Swept]]) -> Figure:
             line[0].set_ylabel("y (units)")
         for axes in grid[-1]:
             axes.set_xlabel("x (units)")
-        figure.colorbar(picture, ax=grid, label="energy of the nearest waypoint's descriptors (no unit)", shrink=0.9 if rows == 1 else 0.5, pad=0.01)
+        figure.colorbar(picture, ax=grid, label="energy E (no unit)", shrink=0.9 if rows == 1 else 0.5, pad=0.01)
         legend = legend_of(grid[0, 0])
         # White marks need a ground to be seen on.
         figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=5, facecolor=COLOURS(0.45), labelcolor="white")
