@@ -14,6 +14,7 @@ from tdf_jax.energy import (
 from tdf_jax.errors import InputError
 from tdf_jax.field import DescriptorField
 from tdf_jax.imitation import imitate, imitate_batch
+from tdf_jax.landscape import Grid, Landscape, energy_landscape, plane_grid
 from tdf_jax.meshes import load_mesh, sample_surface
 from tdf_jax.model import Model, ModelInfo, encode
 from tdf_jax.network import NetworkConfig

@@ -43,7 +43,7 @@ class Grid:
         return self.origin + mesh @ self.directions
 
 
-def plane(
+def plane_grid(
     half: float, count: int = 101, origin: Float[np.ndarray, "3"] | tuple[float, float, float] = (0.0, 0.0, 0.0), axes: str = "xy"
 ) -> Grid:
     """A square of a plane of the world.
@@ -58,14 +58,14 @@ def plane(
         InputError: a side of no length, fewer than two points, an origin that is no point, or unknown axes.
     """
     if not 0 < half < np.inf:
-        raise InputError(f"plane(): half is {half}; expected a length above 0, metres")
+        raise InputError(f"plane_grid(): half is {half}; expected a length above 0, metres")
     if not isinstance(count, int | np.integer) or count < 2:
-        raise InputError(f"plane(): count is {count}; expected a whole number of at least 2")
+        raise InputError(f"plane_grid(): count is {count}; expected a whole number of at least 2")
     if axes not in PLANES:
-        raise InputError(f"plane(): axes is {axes!r}; expected one of {', '.join(PLANES)}")
+        raise InputError(f"plane_grid(): axes is {axes!r}; expected one of {', '.join(PLANES)}")
     origin = np.asarray(origin, dtype=float)
     if origin.shape != (3,) or not np.isfinite(origin).all():
-        raise InputError(f"plane(): origin is {origin.tolist()}; expected three finite numbers, metres")
+        raise InputError(f"plane_grid(): origin is {origin.tolist()}; expected three finite numbers, metres")
     steps = np.linspace(-half, half, count)
     return Grid(origin, np.eye(3)[["xyz".index(axis) for axis in axes]], (steps, steps))
 
@@ -86,6 +86,11 @@ class Landscape:
     def least(self) -> Float[np.ndarray, "*shape"]:
         """E(x): the least of all waypoints' energies at a point."""
         return self.values.min(axis=0)
+
+    @property
+    def mean(self) -> Float[np.ndarray, "*shape"]:
+        """The mean of all waypoints' energies at a point: eq. 2 of a trajectory whose waypoints all stand there."""
+        return self.values.mean(axis=0)
 
     @property
     def minimisers(self) -> Float[np.ndarray, "poses 3"]:

@@ -234,6 +234,9 @@ def wave(
     return _trajectory("wave", poses, start, end, rotation, end_rotation, sine, height, bulge)
 
 
+SHAPES = {"line": line, "semicircle": semicircle, "wave": wave}
+
+
 def resample(trajectory: Trajectory, poses: int) -> Trajectory:
     """The same path with another number of poses, evenly spaced by the length of the translations' polyline.
 

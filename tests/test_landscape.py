@@ -12,11 +12,11 @@ import tdf_jax as tdf
 from tdf_jax import landscape, poses
 from tdf_jax.energy import waypoint_loss
 from tdf_jax.errors import InputError
-from tdf_jax.landscape import Grid, Landscape, energy_landscape, plane
+from tdf_jax.landscape import Grid, Landscape, energy_landscape, plane_grid
 
 
 def test_a_plane_is_a_square_of_points_about_its_middle():
-    grid = plane(0.2, 5, origin=(1.0, 2.0, 3.0), axes="xz")
+    grid = plane_grid(0.2, 5, origin=(1.0, 2.0, 3.0), axes="xz")
     assert grid.shape == (5, 5)
     assert grid.points.shape == (5, 5, 3)
     np.testing.assert_allclose(grid.points[0, 0], (0.8, 2.0, 2.8))
@@ -46,7 +46,7 @@ def test_energies_equal_those_of_single_poses(field, reference, turned, monkeypa
 
 def test_the_demonstrations_own_waypoints_are_the_minimisers(small_model):
     """On the object of the demonstration itself, each waypoint's energy is zero at its place."""
-    grid = plane(0.3, 7)
+    grid = plane_grid(0.3, 7)
     places = [(2, 5), (3, 3), (6, 1)]
     path = jnp.asarray([[1, 0, 0, 0, *grid.points[place]] for place in places], jnp.float32)
     query = tdf.box_query(jax.random.key(2), count=8, size=0.05)
@@ -61,13 +61,14 @@ def test_the_demonstrations_own_waypoints_are_the_minimisers(small_model):
 
 def test_the_least_is_over_waypoints():
     values = np.arange(8.0).reshape(2, 2, 2)[::-1]
-    np.testing.assert_array_equal(Landscape(plane(1.0, 2), values).least, [[0, 1], [2, 3]])
+    np.testing.assert_array_equal(Landscape(plane_grid(1.0, 2), values).least, [[0, 1], [2, 3]])
+    np.testing.assert_array_equal(Landscape(plane_grid(1.0, 2), values).mean, [[2, 3], [4, 5]])
 
 
 def test_another_grid_of_one_size_compiles_nothing(field, reference):
-    energy_landscape(field, reference, plane(0.2, 3))
+    energy_landscape(field, reference, plane_grid(0.2, 3))
     with compilations() as names:
-        energy_landscape(field, reference, plane(0.4, 3, origin=(0.1, 0.0, 0.0), axes="yz"))
+        energy_landscape(field, reference, plane_grid(0.4, 3, origin=(0.1, 0.0, 0.0), axes="yz"))
     assert names == []
 
 
@@ -84,12 +85,12 @@ def test_another_grid_of_one_size_compiles_nothing(field, reference):
 )
 def test_grids_that_make_no_sense_are_refused(arguments, words):
     with pytest.raises(InputError, match=words):
-        plane(**arguments)
+        plane_grid(**arguments)
 
 
 def test_what_does_not_fit_is_refused(field, reference):
     with pytest.raises(InputError, match=r"rotation has shape \(7,\)"):
-        energy_landscape(field, reference, plane(0.2, 3), jnp.zeros(7))
+        energy_landscape(field, reference, plane_grid(0.2, 3), jnp.zeros(7))
     other = dataclasses.replace(reference, descriptors=reference.descriptors[..., :5])
     with pytest.raises(InputError, match="same model"):
-        energy_landscape(field, other, plane(0.2, 3))
+        energy_landscape(field, other, plane_grid(0.2, 3))

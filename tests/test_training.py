@@ -195,7 +195,7 @@ def test_curves_show_training_and_both_validations(whole):
     assert len(panels) == 4
     for panel, name in zip(panels, ("bce", "iou", "frame", "place")):
         training, full, view, *others = panel.lines
-        np.testing.assert_allclose(training.get_ydata()[-1], np.mean([row[name] for row in rows]), rtol=1e-6)
+        np.testing.assert_allclose(training.get_ydata()[-1], np.mean([row[name] for row in rows[-4:]]), rtol=1e-6)
         assert list(full.get_xdata()) == [20, 40]
         np.testing.assert_allclose(full.get_ydata(), [row["validation"][name] for row in rows if "validation" in row])
         np.testing.assert_allclose(view.get_ydata(), [row["one_view"][name] for row in rows if "one_view" in row])

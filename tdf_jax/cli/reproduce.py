@@ -17,13 +17,22 @@ from tdf_jax.experiments.store import Store
 from tdf_jax.files import replace_file
 
 EXPERIMENTS = ("table1", "fig1", "fig2", "fig3", "fig4", "fig5")
+# What each sets itself; "all" is all of them.
+CHOSEN = {
+    "table1": ("trajectory", "displacement"),
+    "fig1": (),
+    "fig2": ("trajectory", "displacement", "displaced", "distance"),
+    "fig3": ("trajectory", "distance"),
+    "fig4": ("trajectory", "displacement"),
+    "fig5": ("trajectory",),
+}
 RUNS = "runs"  # folder of what was computed
 GRID, FAST_GRID = 101, 31
 FAST = {"inits": 2, "iterations": 60, "queries": 24}
 
 
 def reproduce(
-    experiment: Annotated[Literal["table1", "fig1", "fig2", "fig3", "fig4", "fig5", "all"], tyro.conf.Positional],
+    experiment: Annotated[Literal[*EXPERIMENTS, "all"], tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("reproduction"),
     fast: bool = False,
     weights: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "mug",
@@ -36,10 +45,15 @@ def reproduce(
     Args:
         experiment: which one.
         out: folder for the pictures and tables; what was computed is kept in its folder runs.
-        fast: fewer starts, iterations, query points, seeds and grid points: a look at everything in minutes.
+        fast: fewer seeds and grid points, and fewer starts, iterations and query points where those are not set: a look at everything
+            in minutes.
         weights: a name of shipped weights, or a .safetensors file.
         setting: what all experiments start from; each changes what it is about.
     """
+    names = EXPERIMENTS if experiment == "all" else (experiment,)
+    for name in dict.fromkeys(field for one in names for field in CHOSEN[one]):
+        if getattr(setting, name) != getattr(Setting(), name):
+            raise InputError(f"tdf reproduce: --{name} is set, but {experiment} chooses it itself; drop it")
     if fast:
         untouched = {name: value for name, value in FAST.items() if getattr(setting, name) == getattr(Setting(), name)}
         setting = dataclasses.replace(setting, **untouched)
@@ -49,14 +63,14 @@ def reproduce(
     except OSError as error:
         raise InputError(f"tdf reproduce: cannot make the folder {out} ({error}); expected a writable place") from None
     store = Store(model, out / RUNS)
-    for name in EXPERIMENTS if experiment == "all" else (experiment,):
+    for name in names:
         for path in _COMMANDS[name](store, setting, fast, out):
             print(f"saved {path}")
 
 
 def _table1(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
     plan = table.planned(base, 1, table.FAST_VARIATIONS) if fast else table.planned(base)
-    settings = [setting for *_, chosen in plan for setting in chosen]
+    settings = [setting for _, chosen in plan for setting in chosen]
     _run_all(store, settings, "table 1")
     rows = table.rows(store.run, plan)
     yield _text(out / "table1.md", table.as_markdown(rows))
@@ -107,7 +121,14 @@ _COMMANDS: dict[str, Callable] = dict(zip(EXPERIMENTS, (_table1, _fig1, _fig2, _
 def _run_all(store: Store, settings, words: str) -> dict[object, Run]:
     """Runs of settings, with a progress bar: a mapping's by its names, a sequence's by their number."""
     named = settings if isinstance(settings, dict) else dict(enumerate(settings))
-    return {name: store.run(setting) for name, setting in tqdm(named.items(), desc=words, unit="run")}
+    with tqdm(total=len(named), desc=words, unit="run") as bar:
+
+        def run(setting):
+            result = store.run(setting)
+            bar.update()
+            return result
+
+        return figures.collected(run, named)
 
 
 def _picture(path: Path, figure) -> Path:

@@ -14,9 +14,8 @@ from tdf_jax.meshes import load_mesh
 from tdf_jax.pointcloud import load_points
 from tdf_jax.query import box_query
 from tdf_jax.recording import load_demonstration
-from tdf_jax.trajectory import line, resample, semicircle, wave
+from tdf_jax.trajectory import SHAPES, resample
 
-SHAPES = {"line": line, "semicircle": semicircle, "wave": wave}
 MUG_HEIGHT = 0.12  # metres
 QUERY_SIZE = 0.06  # metres, edge of the box of query points about the handle
 PLACE = (0.0, 0.24, 0.18)  # metres from the pick: 0.30 m away, to the handle's side and up

@@ -19,8 +19,9 @@ DISTANCE_SEEDS = 2
 
 
 def figure1(base: Setting) -> dict[str, Setting]:
-    """The wave after l_t only, and after l_t + l_c; both from the same starts."""
-    return {"l_t": dataclasses.replace(base, k=0.0), "l_t + l_c": base}
+    """After l_t only and after l_t + l_c, from the same starts, the last pose free: after l_t only it misses the place."""
+    free = dataclasses.replace(base, fix_last=False)
+    return {"l_t": dataclasses.replace(free, k=0.0), "l_t + l_c": free}
 
 
 def figure3(base: Setting, distances: Sequence[float] = DISTANCES, seeds: int = DISTANCE_SEEDS) -> dict[tuple, Setting]:

@@ -5,15 +5,17 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from tdf_jax.demonstration import Reference, describe, thinned
 from tdf_jax.experiments import setting as settings
 from tdf_jax.experiments.setting import SHAPES, Setting
-from tdf_jax.landscape import Landscape, energy_landscape, plane
+from tdf_jax.landscape import Landscape, energy_landscape, plane_grid
 from tdf_jax.model import Model, encode
 from tdf_jax.trajectory import Trajectory
 
 HALF = 1.2  # of the square's side, in the paper's unit
+UPRIGHT_TURN = 60.0  # degrees about z of the turned mugs, whose true paths so stay in the plane; `Setting.turn` if it is a number
 FIELDS = {  # what lies in the field, in words: which mug, and whether it is turned
     "reference mug": (0, False),
     "test mug": (1, False),
@@ -29,7 +31,8 @@ class Swept:
     Attributes:
         x, y: coordinates of the grid.
         energies: E at (x, y).
-        path: the demonstration's waypoints.
+        path: the demonstration's waypoints, relative to the cloud's centre.
+        carried: the same, turned with the mug.
         minimisers: x_i* of every waypoint.
         outline: points of the object, projected.
     """
@@ -38,6 +41,7 @@ class Swept:
     y: Float[np.ndarray, " count"]
     energies: Float[np.ndarray, "count count"]
     path: Float[np.ndarray, "poses 2"]
+    carried: Float[np.ndarray, "poses 2"]
     minimisers: Float[np.ndarray, "poses 2"]
     outline: Float[np.ndarray, "points 2"]
 
@@ -45,7 +49,8 @@ class Swept:
 def figure2(model: Model, base: Setting, field: str, count: int = 101) -> dict[str, Swept]:
     """Landscapes of one field, a panel a shape.
 
-    The query frame keeps the demonstration's axes, the world's up to the tilt of the handle; the paper's are the identity.
+    The query frame has the world's axes, as in the paper: the handle's frame is not tilted. A turned mug is turned about z, and the energy is
+    still that of the world's axes, so its minima lie where both the turned path and the axes are near.
 
     Args:
         model: the network.
@@ -54,22 +59,34 @@ def figure2(model: Model, base: Setting, field: str, count: int = 101) -> dict[s
         count: points along a side of the grid.
     """
     which, turn = FIELDS[field]
-    shapes = {name: dataclasses.replace(base, trajectory=name, turn=base.turn if turn else 0.0) for name in SHAPES}
+    shapes = {name: dataclasses.replace(base, trajectory=name, turn=0.0) for name in SHAPES}
     scenes = {name: settings.scene(setting) for name, setting in shapes.items()}
     scene = scenes["line"]
     references = {name: describe(model, one.demonstration) for name, one in scenes.items()}
-    points = scene.points if which else (scene.demonstration.points @ settings.rotation(shapes["line"]).T).astype(np.float32)
-    trajectory = scene.demonstration.trajectory
-    # The query follows the centroid, as the losses do: relative to it, both mugs lie in one place.
+    degrees = (UPRIGHT_TURN if base.turn == "any" else base.turn) if turn else 0.0
+    R = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+    points = ((scene.points if which else scene.demonstration.points) @ R.T).astype(np.float32)
     seen = encode(model, thinned(model, points))
-    shift = np.asarray(seen.origin) - scene.demonstration.points.mean(axis=0)
-    pick = np.asarray(trajectory.translations[0]) + shift
-    swept = energy_landscape(seen, _joined(list(references.values())), plane(HALF * base.unit, count, pick), trajectory.rotations[0])
-    n = base.poses
-    return {
-        name: _panel(Landscape(swept.grid, swept.values[n * index : n * (index + 1)]), scenes[name], points, pick, shift, base.unit)
-        for index, name in enumerate(SHAPES)
-    }
+    # The paths are relative to the clouds' centres, as in the losses: on another mug they lie where its centre takes them.
+    paths = {name: np.asarray(reference.trajectory.translations + seen.origin) for name, reference in references.items()}
+    pick, orientation = paths["line"][0], references["line"].trajectory.rotations[0]
+    swept = energy_landscape(seen, _joined(list(references.values())), plane_grid(HALF * base.unit, count, pick), orientation)
+
+    def flat(x):
+        return (np.asarray(x) - pick)[..., :2] / base.unit
+
+    panels = {}
+    for name, values in zip(SHAPES, np.split(swept.values, len(SHAPES))):
+        landscape = Landscape(swept.grid, values)
+        panels[name] = Swept(
+            *(steps / base.unit for steps in swept.grid.coordinates),
+            energies=getattr(landscape, base.field_energy),
+            path=flat(paths[name]),
+            carried=flat((paths[name] - seen.origin) @ R.T + seen.origin),
+            minimisers=flat(landscape.minimisers),
+            outline=flat(points),
+        )
+    return panels
 
 
 def _joined(references):
@@ -78,18 +95,4 @@ def _joined(references):
         jnp.concatenate([one.descriptors for one in references]),
         Trajectory(jnp.concatenate([one.trajectory.wxyz_xyz for one in references])),
         references[0].query,
-    )
-
-
-def _panel(landscape, scene, points, pick, shift, unit):
-    def flat(x):
-        return (np.asarray(x) - pick)[..., :2] / unit
-
-    return Swept(
-        x=landscape.grid.coordinates[0] / unit,
-        y=landscape.grid.coordinates[1] / unit,
-        energies=landscape.least,
-        path=flat(np.asarray(scene.demonstration.trajectory.translations) + shift),
-        minimisers=flat(landscape.minimisers),
-        outline=flat(points),
     )

@@ -12,6 +12,7 @@ from tdf_jax.evaluation.scene import Scene
 from tdf_jax.experiments.figures import PAPER_DISTANCES, mean_over_seeds, turned
 from tdf_jax.experiments.landscapes import Swept
 from tdf_jax.experiments.run import Run
+from tdf_jax.experiments.table import vector
 from tdf_jax.trajectory import Trajectory
 from tdf_jax.viz.style import CLOUD, COLOURS, INK, STYLE, TRUTH, blank_figure, legend_of
 from tdf_jax.viz.view import View, bounds, content, draw, frame, triangles_of, waypoint_bar
@@ -23,7 +24,7 @@ OUTLINE = 400  # points of an object's outline
 
 
 def figure1(runs: dict[str, Run], scene: Scene) -> Figure:
-    """Reference, random start, after l_t only, after l_t + l_c.
+    """Reference, random start, after l_t only, after l_t + l_c: one start, that which l_t + l_c takes furthest.
 
     Args:
         runs: of `tdf_jax.experiments.figures.figure1`.
@@ -36,7 +37,7 @@ def figure1(runs: dict[str, Run], scene: Scene) -> Figure:
     views = {
         "reference": View(shown.points, triangles_of(scene.meshes[0]), shown.trajectory),
         "random start": View(trajectory=Trajectory(whole.starts[whole.best]), **test),
-        r"after $l_t$ alone": View(trajectory=Trajectory(alone.trajectory), expected=truth, **test),
+        r"after $l_t$ alone": View(trajectory=Trajectory(alone.found[whole.best]), expected=truth, **test),
         r"after $l_t + k\,l_c$": View(trajectory=Trajectory(whole.trajectory), expected=truth, **test),
     }
     return _panels(list(views.items()), 2, bounds(np.asarray(shown.query)), len(whole.expected))
@@ -51,7 +52,7 @@ def figure4(runs: dict[tuple, Run], scenes: dict[tuple, Scene]) -> Figure:
     views = []
     for (shape, displacement), run in runs.items():
         scene = scenes[shape, displacement]
-        title = shape if not any(displacement) else f"{shape}, endpoint + {_vector(displacement)}"
+        title = shape if not any(displacement) else f"{shape}, endpoint + {vector(displacement)}"
         views.append(
             (
                 title,
@@ -82,7 +83,7 @@ def figure4_turn(runs: dict[tuple, Run]) -> Figure:
                     axes.plot(steps, angles, SHAPE_STYLES[shape], color=SHAPE_COLOURS[shape], marker="o", ms=3, label=shape)
                     truth = turned(run.expected, run.reference)
             axes.plot(steps, truth, color=TRUTH, lw=1, ls=":", label="even turn to the goal")
-            axes.set_title("endpoint not displaced" if not any(displacement) else f"endpoint displaced by {_vector(displacement)}")
+            axes.set_title("endpoint not displaced" if not any(displacement) else f"endpoint displaced by {vector(displacement)}")
             axes.set_xlabel("pose, from the pick to the place")
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
             _plain(axes)
@@ -112,14 +113,14 @@ def figure5(runs: dict[str, Run]) -> Figure:
 
 def figure3(runs: dict[tuple, Run]) -> Figure:
     """Error against the distance of the query points from the cloud's centre; the paper's three distances are marked."""
-    panels = {
-        "pick pose": ("distance from the truth (cm)", lambda run: 100 * run.pick_error[0]),
-        "pick pose ": ("angle from the truth (degrees)", lambda run: np.degrees(run.pick_error[1])),
-        "mean over all poses": ("distance from the truth (cm)", lambda run: 100 * run.waypoint_error[0]),
-    }
+    panels = (
+        ("pick pose", "distance from the truth (cm)", lambda run: 100 * run.pick_error[0]),
+        ("pick pose", "angle from the truth (degrees)", lambda run: np.degrees(run.pick_error[1])),
+        ("mean over all poses", "distance from the truth (cm)", lambda run: 100 * run.waypoint_error[0]),
+    )
     with matplotlib.rc_context(STYLE):
         figure = blank_figure(WIDTH, 2.6, layout="constrained")
-        for axes, (title, (label, value)) in zip(figure.subplots(1, len(panels)), panels.items()):
+        for axes, (title, label, value) in zip(figure.subplots(1, len(panels)), panels):
             for (k, row), style, colour in zip(mean_over_seeds(runs, value).items(), ("-", "--"), (0.2, 0.7)):
                 axes.plot(list(row), list(row.values()), style, color=COLOURS(colour), marker="o", ms=3, label=f"k = {k:g}")
             for distance in PAPER_DISTANCES:
@@ -155,9 +156,9 @@ def figure2(fields: dict[str, dict[str, Swept]]) -> Figure:
         for axes in grid[-1]:
             axes.set_xlabel("x (units)")
         figure.colorbar(picture, ax=grid, label="energy E (no unit)", shrink=0.9 if rows == 1 else 0.5, pad=0.01)
-        legend = legend_of(grid[0, 0])
+        legend = legend_of(grid[-1, 0])
         # White marks need a ground to be seen on.
-        figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=5, facecolor=COLOURS(0.45), labelcolor="white")
+        figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=6, facecolor=COLOURS(0.45), labelcolor="white")
     return figure
 
 
@@ -165,11 +166,15 @@ def _landscape(axes, panel: Swept, low: float, high: float):
     picture = axes.pcolormesh(panel.x, panel.y, panel.energies.T, cmap=COLOURS, vmin=low, vmax=high, shading="nearest", rasterized=True)
     axes.contour(panel.x, panel.y, panel.energies.T, levels=np.linspace(low, high, 13), colors="white", linewidths=0.3, alpha=0.7)
     outline = panel.outline[:: max(1, len(panel.outline) // OUTLINE)]
-    axes.scatter(*outline.T, s=0.6, color="white", alpha=0.5, linewidths=0, label="object's points")
+    axes.scatter(*outline.T, s=0.6, color="white", alpha=0.5, linewidths=0)
+    axes.plot([], [], ".", color="white", ms=3, label="object's points")
     axes.plot(*panel.path.T, color="white", lw=1.0, marker="o", ms=3, mec=INK, mew=0.4, label="demonstration")
-    axes.plot(*panel.minimisers.T, ls="", marker="x", color=TRUTH, ms=5, mew=1.3, label=r"minimisers $x_i^*$")
+    if not np.array_equal(panel.carried, panel.path):
+        axes.plot(*panel.carried.T, color="white", lw=1.0, ls="--", label="turned with the mug")
     for point, marker, label in ((panel.path[0], "s", "start"), (panel.path[-1], "*", "end")):
         axes.plot(*point, marker=marker, ls="", color="white", mec=INK, ms=6 if marker == "s" else 10, mew=0.8, label=label)
+    # Last: the first of them lies under the mark of the start.
+    axes.plot(*panel.minimisers.T, ls="", marker="x", color=TRUTH, ms=5, mew=1.3, label=r"minimisers $x_i^*$")
     axes.set_aspect("equal")
     axes.set(xlim=(panel.x[0], panel.x[-1]), ylim=(panel.y[0], panel.y[-1]))
     axes.xaxis.set_major_locator(MultipleLocator(0.6))
@@ -198,14 +203,10 @@ def _panels(views: Sequence[tuple[str, View]], columns: int, box: Float[np.ndarr
             axes.set_title(title, y=1.0, fontsize=8)
             legend |= legend_of(axes)
         waypoint_bar(figure, poses, (0.62, 0.42 / height, 0.3, 0.1 / height))
-        figure.legend(legend.values(), legend.keys(), loc="lower left", bbox_to_anchor=(0.01, 0.0), ncols=2, frameon=False)
+        figure.legend(legend.values(), legend.keys(), loc="lower left", bbox_to_anchor=(0.01, 0.0), frameon=False)
     return figure
 
 
 def _plain(axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(alpha=0.25, lw=0.5)
-
-
-def _vector(displacement) -> str:
-    return "(" + ", ".join(f"{value:g}" for value in displacement) + ")"

@@ -9,13 +9,15 @@ from jaxtyping import Float
 
 from tdf_jax.demonstration import describe, thinned
 from tdf_jax.energy import descriptor_loss, trajectory_energy
-from tdf_jax.evaluation.truth import pose_error, shape_error
+from tdf_jax.evaluation.truth import FLIP_DEGREES, distance_from_polyline, pose_error, shape_error
 from tdf_jax.experiments import setting as settings
 from tdf_jax.experiments.setting import Setting
 from tdf_jax.model import Model, encode
 from tdf_jax.optimize import optimize
 
 SETTLED = 0.95  # of the loss's drop
+DENSE = 61  # poses of the true path that paths are measured against, whatever their number of poses
+FLIPPED = np.radians(FLIP_DEGREES)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,21 +27,21 @@ class Run:
     Attributes:
         reference: the demonstration.
         expected: the true trajectory on the test mug.
+        path: places of the true trajectory of `DENSE` poses.
         starts, found: of every start, before and after.
         losses: energy of every start before each iteration, and after the last.
         descriptor: l_t alone, of the best start's trajectory and of the true one.
         expected_energy: energy of the true trajectory.
-        origin: centroid of the test mug's cloud, metres.
     """
 
     reference: Float[np.ndarray, "poses 7"]
     expected: Float[np.ndarray, "poses 7"]
+    path: Float[np.ndarray, "dense 3"]
     starts: Float[np.ndarray, "inits poses 7"]
     found: Float[np.ndarray, "inits poses 7"]
     losses: Float[np.ndarray, "inits iterations_and_1"]
     descriptor: Float[np.ndarray, "2"]
     expected_energy: Float[np.ndarray, ""]
-    origin: Float[np.ndarray, "3"]
 
     @property
     def best(self) -> int:
@@ -76,8 +78,18 @@ class Run:
         return float(distance), float(angle)
 
     @property
+    def flipped(self) -> bool:
+        """Whether the pick is turned by more than `FLIP_DEGREES`."""
+        return self.pick_error[1] > FLIPPED
+
+    @property
+    def path_error(self) -> float:
+        """Mean distance, metres, of the true path, densely sampled, from the polyline through the found poses: few poses cut corners."""
+        return float(np.mean(distance_from_polyline(self.path, self.trajectory[:, 4:])))
+
+    @property
     def waypoint_error(self) -> tuple[float, float]:
-        """Mean distance, metres, and angle, radians, of the poses from the true ones."""
+        """Mean distance, metres, and angle, radians, of the poses from the true ones; a fixed last pose counts, with no error."""
         distance, angle = pose_error(self.trajectory, self.expected)
         return float(distance.mean()), float(angle.mean())
 
@@ -104,22 +116,24 @@ def imitation(model: Model, setting: Setting) -> Run:
     reference = describe(model, scene.demonstration)
     field = encode(model, thinned(model, scene.points))
     goal = settings.goal(setting, field, reference)
+    reference = settings.aim(setting, reference)
     key = jax.random.fold_in(jax.random.key(setting.seed), settings.STREAM + 1)
     result = optimize(
         field, reference, key, goal=goal, fix_last=setting.fix_last, energy=setting.energy, config=setting.optimiser
     )
     expected = scene.expected(goal)
+    dense = settings.scene(dataclasses.replace(setting, poses=DENSE)).expected(goal)
     found = result.trajectory
     weights = jax.tree.map(lambda weight: jnp.asarray(weight, jnp.float32), setting.energy)
     return Run(
         reference=np.asarray(scene.demonstration.trajectory.wxyz_xyz),
         expected=np.asarray(expected.wxyz_xyz),
+        path=np.asarray(dense.translations),
         starts=np.asarray(result.starts),
         found=np.asarray(result.trajectories),
         losses=np.column_stack([result.losses, result.energies]),
         descriptor=np.array([_descriptor_loss(one, field, reference) for one in (found, expected)]),
         expected_energy=np.asarray(_energy(expected, field, reference, weights)),
-        origin=np.asarray(field.origin),
     )
 
 

@@ -18,10 +18,12 @@ from tdf_jax.meshes import sample_surface
 from tdf_jax.optimize import STARTS, OptimizeConfig, default_goal
 from tdf_jax.query import box_query, gaussian_query
 from tdf_jax.shapes import Mug, scaled
-from tdf_jax.trajectory import Trajectory, line, semicircle, wave
+from tdf_jax.trajectory import SHAPES, Trajectory
 
-SHAPES = {"line": line, "semicircle": semicircle, "wave": wave}
 QUERIES = ("box", "gaussian")
+CORRELATED = ("demonstration", "stretched")
+FIELD_ENERGIES = ("least", "mean")
+SEEDS = 2**32  # jax takes no larger one
 END = (0.0, 0.83, 0.0)  # from the first pose to the last, in the paper's unit: figure 2 marks (0, 0) and (0, 0.83)
 POINTS = 1500  # of a cloud, before `describe` and `imitate` thin it
 STREAM = 0x7AB1E1  # of the setting's draws
@@ -29,31 +31,36 @@ STREAM = 0x7AB1E1  # of the setting's draws
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """One imitation. The first seven are the paper's; it leaves the others open, and docs/paper.md says why they are as they are.
+    """One imitation. The paper gives trajectory, displacement, k, iterations and distance; the rest is read from its figures or left open, and
+    docs/paper.md says why it is as it is.
 
     Attributes:
         trajectory: the demonstration's shape, from the handle to a place 0.83 units along y; it bows to +x, the handle's side.
         displacement: world vector, in the paper's unit.
         displaced: what it moves: the endpoint ("goal", table 1), or the test mug and so the starting point ("start", section 3.1).
         k: weight of the correlation term, per unit.
-        poses: n.
+        poses: of the trajectory, n.
         iterations: optimisation steps; the paper's epochs.
-        distance: of the first pose from the cloud's centre, on the handle's side (figure 3), in the paper's unit; none: at the handle.
-        pose_norm: see `tdf_jax.EnergyWeights`.
+        distance: of the first pose from the cloud's centre, on the handle's side, in the paper's unit (figure 3); by default it is at the
+            handle.
+        correlated: what the correlation term pulls towards: the demonstration, or the demonstration stretched to the displaced goal,
+            waypoint i of n moved by i / (n - 1) of the displacement.
+        pose_norm: norm of the correlation term, see docs/energy.md.
         lever: metres that a turn of one unit counts as in the correlation term.
-        compensator: weight of eq. 6.
-        compensator_order: see `tdf_jax.EnergyWeights`.
-        fix_last: keep the last pose at the goal.
-        query: "box", uniform in a cube, or "gaussian", as NDF's demonstrations.
-        query_size: edge of the cube, or standard deviation, metres; none: 0.1 and 0.025.
+        compensator: weight of eq. 6, steps in metres and turns as they are.
+        compensator_order: eq. 6 summed over steps ("frobenius"), or its largest step ("infinity").
+        fix_last: whether the last pose stays at the goal or only starts there.
+        query: query points uniform in a cube ("box"), or normal about its middle as in NDF's demonstrations ("gaussian").
+        query_size: edge of the cube, or standard deviation, metres; by default 0.1 and 0.025.
         queries: number of query points.
-        start: see `tdf_jax.OptimizeConfig`.
+        start: poses random one by one ("scattered"), or the whole demonstration turned at random ("carried").
         translation_rate: Adam's first step size for translations, metres; a pose travels at most half of `iterations` times as far. The
             0.01 m of `tdf_jax.OptimizeConfig` are for a path of 0.3 m.
         inits: random starts; the one with the least energy counts.
         diagonal: of both mugs, metres.
         unit: metres the paper's unit is.
         turn: of the test mug, degrees, about a random axis; "any" is a uniform rotation.
+        field_energy: E(x) of figure 2: the least of the waypoints' energies at x, or their mean.
         seed: which mugs, axis, clouds, query points and starts.
     """
 
@@ -64,6 +71,7 @@ class Setting:
     poses: int = 7
     iterations: int = 100
     distance: float | None = None
+    correlated: Literal["demonstration", "stretched"] = "demonstration"
     pose_norm: Literal["frobenius", "metres_radians", "mean_absolute"] = "frobenius"
     lever: float = 0.05
     compensator: float = 0.0
@@ -78,17 +86,21 @@ class Setting:
     diagonal: float = 0.3
     unit: float = 1.0
     turn: float | Literal["any"] = 60.0
+    field_energy: Literal["least", "mean"] = "least"
     seed: int = 0
 
     def __post_init__(self):
         choices = {"trajectory": SHAPES, "displaced": ("goal", "start"), "query": QUERIES, "start": STARTS}
         choices |= {"pose_norm": POSE_NORMS, "compensator_order": COMPENSATOR_ORDERS}
+        choices |= {"correlated": CORRELATED, "field_energy": FIELD_ENERGIES}
         for name, known in choices.items():
             if getattr(self, name) not in known:
                 raise InputError(f"Setting(): {name} is {getattr(self, name)!r}; expected one of {', '.join(known)}")
         for name, least in {"poses": 2, "iterations": 1, "queries": 1, "inits": 1, "seed": 0}.items():
             if getattr(self, name) < least:
                 raise InputError(f"Setting(): {name} is {getattr(self, name)}; expected at least {least}")
+        if self.seed >= SEEDS:
+            raise InputError(f"Setting(): seed is {self.seed}; expected less than {SEEDS}")
         for name in ("query_size", "diagonal", "unit", "distance", "translation_rate"):
             value = getattr(self, name)
             if value is not None and not 0 < value < np.inf:
@@ -104,7 +116,7 @@ class Setting:
     @property
     def energy(self) -> EnergyWeights:
         """The energy's weights; k per unit becomes k per metre."""
-        return EnergyWeights(self.k / self.unit, self.compensator / self.unit, self.lever, self.pose_norm, self.compensator_order)
+        return EnergyWeights(self.k / self.unit, self.compensator, self.lever, self.pose_norm, self.compensator_order)
 
     @property
     def optimiser(self) -> OptimizeConfig:
@@ -188,6 +200,17 @@ def scene(setting: Setting) -> Scene:
         T_world_handles=(a.handle_frame, T_world_b @ b.handle_frame),
         meshes=(a.mesh, b.mesh.copy().apply_transform(T_world_b)),
     )
+
+
+def aim(setting: Setting, reference: Reference) -> Reference:
+    """The reference with what the correlation term pulls towards, see `Setting.correlated`."""
+    if setting.correlated == "demonstration":
+        return reference
+    offset = setting.offset if setting.displaced == "goal" else -setting.offset
+    s = np.linspace(0, 1, setting.poses)[:, None]
+    wxyz_xyz = reference.trajectory.wxyz_xyz
+    stretched = Trajectory(wxyz_xyz.at[:, 4:].add(np.asarray(s * offset, wxyz_xyz.dtype)))
+    return dataclasses.replace(reference, trajectory=stretched)
 
 
 def goal(setting: Setting, field: DescriptorField, reference: Reference) -> Float[Array, "7"]:

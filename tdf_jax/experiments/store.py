@@ -4,7 +4,9 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -15,6 +17,8 @@ from tdf_jax.experiments.run import Run, imitation
 from tdf_jax.experiments.setting import SHAPES, Setting
 from tdf_jax.files import replace_file
 from tdf_jax.model import Model
+
+FORMAT = 1  # of the files, and of what they hold: raised when a run is computed otherwise
 
 
 class Store:
@@ -28,11 +32,13 @@ class Store:
     def __init__(self, model: Model, directory: Path):
         self.model, self.directory = model, directory
         leaves = jax.tree.leaves(model.params)
-        self._weights = hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in leaves)).hexdigest()
+        weights = hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in leaves)).hexdigest()
+        # All that a result depends on, so that a folder never mixes what different versions computed.
+        self._about = [FORMAT, version("tdf_jax"), weights, dataclasses.asdict(model.config), model.info.cloud_points]
 
     def run(self, setting: Setting) -> Run:
         """One imitation."""
-        return Run(**self._kept(["run", dataclasses.asdict(setting)], lambda: dataclasses.asdict(imitation(self.model, setting))))
+        return self._kept(["run", setting], lambda: dataclasses.asdict(imitation(self.model, setting)), lambda arrays: Run(**arrays))
 
     def landscapes(self, base: Setting, field: str, count: int) -> dict[str, Swept]:
         """Figure 2 of one field, see `tdf_jax.experiments.landscapes.figure2`."""
@@ -41,19 +47,22 @@ class Store:
             panels = figure2(self.model, base, field, count)
             return {f"{name}.{part}": value for name, panel in panels.items() for part, value in dataclasses.asdict(panel).items()}
 
-        arrays = self._kept(["landscapes", dataclasses.asdict(base), field, count], swept)
-        parts = [part.name for part in dataclasses.fields(Swept)]
-        return {name: Swept(**{part: arrays[f"{name}.{part}"] for part in parts}) for name in SHAPES}
+        def panels(arrays):
+            parts = [part.name for part in dataclasses.fields(Swept)]
+            return {name: Swept(**{part: arrays[f"{name}.{part}"] for part in parts}) for name in SHAPES}
 
-    def _kept(self, what: list, compute: Callable[[], dict]) -> dict:
-        name = hashlib.sha256(json.dumps([self._weights, *what], sort_keys=True).encode()).hexdigest()[:20]
+        return self._kept(["landscapes", base, field, count], swept, panels)
+
+    def _kept(self, what: list, compute: Callable[[], dict], build: Callable[[dict], Any]) -> Any:
+        about = json.dumps([self._about, what], sort_keys=True, default=dataclasses.asdict)
+        name = hashlib.sha256(about.encode()).hexdigest()[:20]
         path = self.directory / f"{name}.npz"
         if not path.exists():
             arrays = compute()
-            replace_file("tdf reproduce", path, lambda file: np.savez(file, **arrays))
-            return arrays
+            replace_file("Store", path, lambda file: np.savez(file, **arrays))
+            return build(arrays)
         try:
             with np.load(path) as file:
-                return dict(file)
+                return build(dict(file))
         except Exception as error:  # damaged files raise whatever their parser stumbles on
-            raise InputError(f"tdf reproduce: {path} cannot be read ({error}); delete it, and run the command again") from None
+            raise InputError(f"Store: {path} cannot be read ({error}); delete it: it is computed again") from None

@@ -82,4 +82,4 @@ def _read(path, parse):
         return parse(path.read_bytes())
     except Exception as error:  # damaged files raise whatever their parser stumbles on
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"train(): {path} cannot be read ({reason}); delete the folder, or restore the file") from None
+        raise InputError(f"train(): {path} cannot be read ({reason}): damaged, or of another version; delete the folder, or restore the file") from None

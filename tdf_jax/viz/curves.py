@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 
 from tdf_jax.viz.style import INK, STYLE, TRUTH
 
@@ -28,7 +29,7 @@ def training_figure(rows: Sequence[dict]) -> Figure:
         figure = Figure(figsize=(7.2, 4.6), layout="constrained")
         axes = figure.subplots(2, 2, sharex=True)
         steps = np.array([row["step"] for row in rows])
-        width = min(SMOOTH, len(rows))
+        width = max(1, min(SMOOTH, len(rows) // 10))
         for panel, (name, label, scale) in zip(axes.flat, PANELS):
             values = np.convolve([row[name] for row in rows], np.ones(width) / width, mode="valid")
             panel.plot(steps[width - 1 :], values, color="#9aa5b1", lw=1, label=f"training, mean of {width} steps")
@@ -38,7 +39,8 @@ def training_figure(rows: Sequence[dict]) -> Figure:
             panel.set(title=label, yscale=scale)
             if scale == "log":
                 panel.yaxis.set_major_formatter("{x:g}")
-                panel.yaxis.set_minor_formatter("")
+                # Within less than a decade the powers of ten alone would leave an axis without a number.
+                panel.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1, 0.5)))
             panel.grid(color="#dddddd", lw=0.5)
         shares = [(row["step"], row["transfer"]["success"]) for row in rows if "transfer" in row]
         transfer = axes[0, 1].plot(*np.array(shares).reshape(-1, 2).T, color="#2a6f97", ls="--", marker="o", ms=2.5, lw=1)
