@@ -13,15 +13,18 @@ from tdf_jax.energy import (
 )
 from tdf_jax.errors import InputError
 from tdf_jax.field import DescriptorField
+from tdf_jax.grid import Grid, path_grid, plane_grid, volume_grid
 from tdf_jax.imitation import imitate, imitate_batch
-from tdf_jax.landscape import Grid, Landscape, energy_landscape, plane_grid
+from tdf_jax.landscape import Landscape, load_landscape, save_landscape
 from tdf_jax.meshes import load_mesh, sample_surface
 from tdf_jax.model import Model, ModelInfo, encode
 from tdf_jax.network import NetworkConfig
 from tdf_jax.optimize import OptimizeConfig, Result, optimize
 from tdf_jax.pointcloud import load_points, thin
-from tdf_jax.query import box_query, gaussian_query, gripper_query, lattice_query
+from tdf_jax.query import box_query, gaussian_query, gripper_query, lattice_query, snapped_query
+from tdf_jax.route import lowest_cost_path
 from tdf_jax.shapes import MugParameters, build_mug, sample_mug
+from tdf_jax.sweep import energy_landscape
 from tdf_jax.trajectory import (
     Trajectory,
     displace,

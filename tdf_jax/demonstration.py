@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from tdf_jax.descriptor import check_query, trajectory_descriptor
 from tdf_jax.errors import InputError
 from tdf_jax.model import Model, encode
-from tdf_jax.pointcloud import check_points, thin
+from tdf_jax.pointcloud import check_points
 from tdf_jax.trajectory import Trajectory, check_trajectory
 
 
@@ -84,15 +84,9 @@ def describe(model: Model, demonstrations: Demonstration | Sequence[Demonstratio
                 "Use one query set and resample() the trajectories"
             )
     query = jnp.asarray(first.query)
-    fields = [encode(model, thinned(model, demo.points)) for demo in demonstrations]
+    fields = [encode(model, demo.points) for demo in demonstrations]
     descriptors = sum(_describe(field, demo.trajectory, query) for field, demo in zip(fields, demonstrations)) / len(fields)
     return Reference(descriptors, first.trajectory.shifted(-fields[0].origin), query)
 
 
 _describe = jax.jit(trajectory_descriptor)
-
-
-def thinned(model: Model, points: Float[Array, "points 3"]) -> Float[Array, "points 3"]:
-    """The points at the density the network was trained on; all of them where it is not known."""
-    count = model.info.cloud_points
-    return points if count is None else thin(np.asarray(check_points(points)), count)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from tdf_jax.demonstration import Demonstration, Reference, describe, thinned
+from tdf_jax.demonstration import Demonstration, Reference, describe
 from tdf_jax.energy import EnergyWeights
 from tdf_jax.errors import InputError
 from tdf_jax.keys import check_key
@@ -29,7 +29,7 @@ def imitate(
 ) -> Result:
     """Imitate a demonstrated trajectory on a new object of the same category.
 
-    Clouds denser than the network's training clouds are thinned by farthest points (`model.info.cloud_points`).
+    Clouds denser than the network's training clouds are thinned, see `encode`.
 
     Args:
         model: the network.
@@ -51,7 +51,7 @@ def imitate(
     """
     check_key("imitate()", key)
     reference = demonstration if isinstance(demonstration, Reference) else describe(model, demonstration)
-    field = encode(model, thinned(model, points))
+    field = encode(model, points)
     goal = default_goal(field, reference) if goal is None else _finite("goal", goal, (7,))
     if goal_offset is not None:
         goal = goal + jnp.pad(_finite("goal_offset", goal_offset, (3,)), (4, 0))

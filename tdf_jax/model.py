@@ -9,11 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from tdf_jax import pointcloud
+from tdf_jax.errors import InputError
 from tdf_jax.field import DescriptorField
 from tdf_jax.network import NetworkConfig, condition, encode_latent
 from tdf_jax.pointcloud import check_points
 
 CENTRED = 1e-7  # of a cloud's extent: a mean this near zero is float32's rounding
+THINNINGS = 8  # 16 gain another 0.003 of IoU
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,29 +70,48 @@ def value_problems(tensors: Mapping[str, np.ndarray]) -> str:
     return ", ".join(name for name, tensor in tensors.items() if not np.isfinite(tensor).all())
 
 
-def encode(model: Model, points: Float[Array, "points 3"]) -> DescriptorField:
+def encode(model: Model, points: Float[Array, "points 3"], thinnings: int = THINNINGS) -> DescriptorField:
     """Encode an object's point cloud into its descriptor field.
 
-    The points are used as they are, each of them. The field is best where they are as dense as in training: thin a dense
-    cloud to `model.info.cloud_points` with `pointcloud.thin`, as `imitate` does.
+    A network knows clouds of one density (`model.info.cloud_points`): with twice as many points the shipped weights' IoU falls from 0.85 to
+    0.24. A denser cloud is therefore thinned by farthest points, several times, and the latents are averaged: each thinning is another
+    sample of the surface, and eight of them raise the IoU by about 0.03 over one. Where the density is not known, as of converted
+    weights, and where the cloud is no denser, all points are used as they are.
 
     Args:
         model: the network.
         points: at least 21, metres, world frame.
+        thinnings: how many are averaged, see `pointcloud.thinnings`; 0 uses all points as they are.
 
     Returns:
-        The field, in the world frame; it moves and turns with the points exactly.
+        The field, in the world frame; it moves and turns with the points, exactly where they are used as they are, and otherwise but for ties
+        in thinning that rounding decides.
 
     Raises:
-        InputError: the points are fewer than 21, not (points, 3), not finite or all equal.
+        InputError: the points are fewer than 21, not (points, 3), not finite or all equal; thinnings is negative, or the points would
+            be thinned under `jax.jit`.
     """
-    return _encode(model.params, model.config, jnp.asarray(check_points(points)))
+    points, count = check_points(points), model.info.cloud_points
+    if not isinstance(thinnings, int | np.integer) or thinnings < 0:
+        raise InputError(f"encode(): thinnings is {thinnings}; expected a whole number of 0 or more")
+    if not thinnings or count is None or len(points) <= count:
+        return _encode(model.params, model.config, jnp.asarray(points)[None])
+    if isinstance(points, jax.core.Tracer):
+        raise InputError(
+            f"encode(): {len(points)} points cannot be thinned to {count} under jax.jit; expected that many. "
+            "Thin the cloud outside with tdf.thin, or pass thinnings=0"
+        )
+    return _encode(model.params, model.config, jnp.asarray(pointcloud.thinnings(np.asarray(points), count, thinnings)))
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _encode(params, config, points):
-    origin = jnp.mean(points, axis=0)
-    # A cloud that was centred in float32 has a mean of about 1e-9 m left. Centring it again in float64 moves the latent by 1e-6
-    # of its length, so it counts as centred: parity with the original, which leaves centring to the caller, is then exact.
-    origin = jnp.where(jnp.max(jnp.abs(origin)) <= CENTRED * jnp.max(jnp.ptp(points, axis=0)), 0.0, origin)
-    return DescriptorField(condition(params, config, encode_latent(params, config, points - origin)), origin)
+def _encode(params, config, clouds):
+    def one(points):
+        origin = jnp.mean(points, axis=0)
+        # A cloud that was centred in float32 has a mean of about 1e-9 m left. Centring it again in float64 moves the latent by 1e-6
+        # of its length, so it counts as centred: parity with the original, which leaves centring to the caller, is then exact.
+        origin = jnp.where(jnp.max(jnp.abs(origin)) <= CENTRED * jnp.max(jnp.ptp(points, axis=0)), 0.0, origin)
+        return encode_latent(params, config, points - origin), origin
+
+    latents, origins = jax.lax.map(one, clouds)
+    return DescriptorField(condition(params, config, jnp.mean(latents, axis=0)), jnp.mean(origins, axis=0))

@@ -11,6 +11,7 @@ from tdf_jax.errors import InputError
 from tdf_jax.meshes import MESH_SUFFIXES, existing_file, mesh_in, read_scene, sample_surface, unreadable
 
 MINIMUM_POINTS = 21  # the encoder's 20 nearest neighbours, the point itself included, and one to choose from
+PART = 0.7  # of the points; of 0.35, 0.5, 0.7 and 0.9, tried on 30 mugs, this raised the IoU most
 
 _CLOUD_SUFFIXES = (".ply", ".npy", ".npz", ".xyz", ".pcd")
 
@@ -108,6 +109,24 @@ def thin(points: Float[np.ndarray, "points 3"], count: int) -> Float[np.ndarray,
     """Evenly spread subset of a cloud by farthest-point thinning; arguments and errors as `thin_indices`."""
     indices = thin_indices(points, count)
     return points if len(indices) == len(points) else points[indices]
+
+
+def thinnings(points: Float[np.ndarray, "points 3"], count: int, times: int) -> Float[np.ndarray, "times count 3"]:
+    """Several farthest-point thinnings of one cloud: of all its points, then of random parts of it.
+
+    The parts are a function of the number of points. A cloud of less than `2 * count / PART` points is thinned once: a part that is hardly
+    larger than the thinning is no longer spread evenly, and the average of such was worse than the thinning of all.
+
+    Args:
+        points: Points, metres, more than count.
+        count: How many to keep, at least 1.
+        times: How many thinnings, at least 1.
+    """
+    found = [thin(points, count)]
+    rng = np.random.default_rng(len(points))
+    for _ in range(times - 1 if PART * len(points) >= 2 * count else 0):
+        found.append(thin(points[rng.permutation(len(points))[: int(PART * len(points))]], count))
+    return np.stack(found)
 
 
 def thin_indices(points: Float[np.ndarray, "points 3"], count: int) -> Int[np.ndarray, " thinned"]:

@@ -126,6 +126,31 @@ def lattice_query(
     return _centre("lattice_query", centre) + jnp.asarray(points)
 
 
+def snapped_query(
+    query: Float[Array, "queries 3"], pitch: float, centre: Sequence[float] = (0.0, 0.0, 0.0)
+) -> Float[Array, "queries 3"]:
+    """Query points moved to the nearest nodes of a lattice, so that an energy landscape with steps of one pitch shares its evaluations.
+
+    Each moves by at most half a pitch along each axis; some may coincide, and count as often. What it does to the energies,
+    `tdf_jax.sweep.query_change` tells.
+
+    Args:
+        query: points in the query frame, metres.
+        pitch: Distance between neighbouring nodes, metres.
+        centre: A node, metres.
+
+    Returns:
+        As many query points.
+
+    Raises:
+        InputError: If pitch is not above 0 or a shape is wrong.
+    """
+    pitch, centre = _lengths("snapped_query", "pitch", pitch), _centre("snapped_query", centre)
+    if np.ndim(query) != 2 or np.shape(query)[1] != 3:
+        raise InputError(f"snapped_query(): query points have shape {np.shape(query)}; expected (queries, 3), metres.")
+    return centre + pitch * jnp.round((query - centre) / pitch)
+
+
 def _check_count(function: str, count: int) -> None:
     if not isinstance(count, int | np.integer) or count < 1:
         raise InputError(f"{function}(): count is {count}; expected a whole number of at least 1.")

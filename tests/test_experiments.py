@@ -12,11 +12,12 @@ from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
 from tdf_jax.errors import InputError
-from tdf_jax.evaluation.truth import distance_from_polyline, shape_error
+from tdf_jax.evaluation.truth import shape_error
 from tdf_jax.experiments import figures, landscapes, setting as settings, table
 from tdf_jax.experiments.run import Run, imitation
 from tdf_jax.experiments.setting import Setting
 from tdf_jax.experiments.store import Store
+from tdf_jax.grid import distance_from_polyline
 
 TINY = Setting(poses=3, iterations=4, queries=8, inits=2)
 

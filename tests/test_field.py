@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import SMALL, TOLERANCE, carried, enabled, random_cloud, random_poses, relative_error
+from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
 from tdf_jax.errors import InputError
+from tdf_jax.pointcloud import thinnings
 
 # float32 coordinates half a metre away carry 3e-8 m, of offsets of 5 cm; the network's own rounding is 1e-5.
 EQUIVARIANCE = {"float32": 2e-4, "float64": 1e-10}
@@ -114,6 +116,53 @@ def test_gradients_reach_the_points_of_the_least_cloud_where_some_coincide(small
     assert np.isfinite(value) and np.isfinite(gradient).all() and np.linalg.norm(gradient) > 1e-3
     with pytest.raises(InputError, match="20 points; expected at least 21"):
         tdf.encode(small_model, random_cloud(0, 20))
+
+
+@pytest.fixture(scope="module")
+def thinning_model(small_model):
+    """A network that knows clouds of 24 points."""
+    return dataclasses.replace(small_model, info=dataclasses.replace(small_model.info, cloud_points=24))
+
+
+def test_a_dense_cloud_is_thinned_several_times_and_the_latents_averaged(small_model, thinning_model):
+    points = random_cloud(0, 90).astype(np.float32)
+    clouds = thinnings(points, 24, 4)
+    assert clouds.shape == (4, 24, 3)
+    np.testing.assert_array_equal(clouds[0], tdf.thin(points, 24))
+    fields = [tdf.encode(small_model, cloud) for cloud in clouds]
+    latents = np.stack([field.latent for field in fields])
+    assert np.abs(latents - latents[0]).max() > 1e-2 * np.abs(latents).max()
+    found = tdf.encode(thinning_model, points, thinnings=4)
+    np.testing.assert_allclose(found.latent, latents.mean(axis=0), atol=1e-6)
+    np.testing.assert_allclose(found.origin, np.mean([field.origin for field in fields], axis=0), atol=1e-7)
+
+
+def test_the_average_turns_with_the_cloud(thinning_model):
+    points = random_cloud(0, 90)
+    R = Rotation.random(random_state=0).as_matrix()
+    still, moved = (tdf.encode(thinning_model, cloud.astype(np.float32)) for cloud in (points, points @ R.T + 0.3))
+    np.testing.assert_allclose(moved.latent, still.latent @ R.T, atol=1e-4)
+    np.testing.assert_allclose(moved.origin, R @ still.origin + 0.3, atol=1e-6)
+
+
+def test_points_are_used_as_they_are_where_there_is_nothing_to_thin(small_model, thinning_model):
+    dense, sparse = random_cloud(0, 90), random_cloud(0, 24)
+    plain = tdf.encode(small_model, dense).latent  # a density that is not known
+    np.testing.assert_array_equal(tdf.encode(thinning_model, dense, thinnings=0).latent, plain)
+    np.testing.assert_array_equal(tdf.encode(thinning_model, sparse).latent, tdf.encode(small_model, sparse).latent)
+
+
+def test_a_cloud_hardly_denser_is_thinned_once():
+    points = random_cloud(0, 60)
+    assert len(thinnings(points, 24, 8)) == 1
+    assert len(thinnings(points, 20, 8)) == 8
+
+
+def test_thinning_is_refused_where_it_cannot_be_done(thinning_model):
+    with pytest.raises(InputError, match="90 points cannot be thinned to 24 under jax.jit"):
+        jax.jit(lambda points: tdf.encode(thinning_model, points).latent)(random_cloud(0, 90))
+    with pytest.raises(InputError, match="thinnings is -1"):
+        tdf.encode(thinning_model, random_cloud(0, 90), thinnings=-1)
 
 
 def spoiled(value):

@@ -1,96 +1,114 @@
-"""Energy landscapes: grids, equality with the energy of poses one by one, minimisers."""
+"""Landscapes: what is made of a sweep's energies, and their files."""
 
 import dataclasses
+import io
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import compilations, random_cloud, random_poses
 
 import tdf_jax as tdf
-from tdf_jax import landscape, poses
-from tdf_jax.energy import waypoint_loss
 from tdf_jax.errors import InputError
-from tdf_jax.landscape import Grid, Landscape, energy_landscape, plane_grid
+from tdf_jax.grid import Grid, path_grid, plane_grid, volume_grid
+from tdf_jax.landscape import Landscape, load_landscape, save_landscape
 
 
-def test_a_plane_is_a_square_of_points_about_its_middle():
-    grid = plane_grid(0.2, 5, origin=(1.0, 2.0, 3.0), axes="xz")
-    assert grid.shape == (5, 5)
-    assert grid.points.shape == (5, 5, 3)
-    np.testing.assert_allclose(grid.points[0, 0], (0.8, 2.0, 2.8))
-    np.testing.assert_allclose(grid.points[4, 1], (1.2, 2.0, 2.9))
-    np.testing.assert_allclose(grid.points[2, 2], (1.0, 2.0, 3.0))
+def made(values, grid=None, **fields):
+    """A landscape of given energies, in one orientation."""
+    values = np.asarray(values, float)
+    fields = {"waypoints": np.zeros((len(values), 3)), "rotations": np.eye(3)[None], "turned": np.zeros(values.shape, np.int32)} | fields
+    return Landscape(grid or plane_grid(1.0, 2), values, **fields)
 
 
-def test_grids_may_be_lines_and_volumes_along_any_directions():
-    tilted = np.array([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
-    volume = Grid(np.array([1.0, 0.0, 0.0]), tilted, (np.array([0.0, 1.0]), np.array([0.0, 2.0, 3.0]), np.array([5.0])))
-    assert volume.points.shape == (2, 3, 1, 3)
-    np.testing.assert_allclose(volume.points[1, 2, 0], (1 + 0.6 - 2.4, 0.8 + 1.8, 5.0))
+@pytest.fixture
+def landscape():
+    """Two waypoints over two by two points."""
+    return made(np.arange(8.0).reshape(2, 2, 2)[::-1] / 100)
 
 
-@pytest.mark.parametrize("turned", [False, True])
-def test_energies_equal_those_of_single_poses(field, reference, turned, monkeypatch):
-    monkeypatch.setattr(landscape, "CHUNK_POINTS", 40)  # 8 query points: five grid points at a time, a last chunk of four
-    R = poses.rotation(jnp.asarray(random_poses(5, 1)[0], jnp.float32)) if turned else jnp.eye(3)
-    grid = Grid(np.asarray(field.origin), np.eye(3)[:2], (np.linspace(-0.1, 0.1, 4), np.linspace(-0.2, 0.1, 6)))
-    swept = energy_landscape(field, reference, grid, R if turned else None)
-    assert swept.values.shape == (4, 4, 6)
-    for waypoint, row, column in [(0, 0, 0), (1, 3, 5), (2, 1, 2), (3, 2, 4)]:
-        t = jnp.asarray(grid.points[row, column], jnp.float32)
-        expected = waypoint_loss(R, t, field, reference.query, reference.descriptors[waypoint])
-        np.testing.assert_allclose(swept.values[waypoint, row, column], expected, rtol=1e-5)
+def test_the_least_and_the_mean_are_over_waypoints(landscape):
+    np.testing.assert_allclose(landscape.combined, np.array([[0, 1], [2, 3]]) / 100)
+    np.testing.assert_allclose(dataclasses.replace(landscape, reduce="mean").combined, np.array([[2, 3], [4, 5]]) / 100)
 
 
-def test_the_demonstrations_own_waypoints_are_the_minimisers(small_model):
-    """On the object of the demonstration itself, each waypoint's energy is zero at its place."""
-    grid = plane_grid(0.3, 7)
-    places = [(2, 5), (3, 3), (6, 1)]
-    path = jnp.asarray([[1, 0, 0, 0, *grid.points[place]] for place in places], jnp.float32)
-    query = tdf.box_query(jax.random.key(2), count=8, size=0.05)
-    demonstration = tdf.Demonstration(jnp.asarray(random_cloud(0), jnp.float32), tdf.Trajectory(path), query)
-    swept = energy_landscape(tdf.encode(small_model, demonstration.points), tdf.describe(small_model, demonstration), grid)
-    np.testing.assert_allclose(swept.minimisers, path[:, 4:], atol=1e-6)
-    for waypoint, place in enumerate(places):
-        assert swept.values[waypoint][place] < 1e-6
-        assert swept.least[place] < 1e-6
-    assert np.median(swept.least) > 1e-4
+def test_the_soft_least_lies_between_the_least_and_the_mean(landscape):
+    soft = dataclasses.replace(landscape, reduce="soft_least", temperature=0.01)
+    np.testing.assert_allclose(soft.combined, -0.01 * np.log(np.mean(np.exp(-soft.values / 0.01), axis=0)))
+    least, mean = landscape.combined, dataclasses.replace(landscape, reduce="mean").combined
+    np.testing.assert_allclose(dataclasses.replace(soft, temperature=1e-9).combined, least, atol=1e-8)  # and does not overflow
+    np.testing.assert_allclose(dataclasses.replace(soft, temperature=1e3).combined, mean, rtol=1e-4)
+    assert ((least < soft.combined) & (soft.combined < mean)).all()
 
 
-def test_the_least_is_over_waypoints():
-    values = np.arange(8.0).reshape(2, 2, 2)[::-1]
-    np.testing.assert_array_equal(Landscape(plane_grid(1.0, 2), values).least, [[0, 1], [2, 3]])
-    np.testing.assert_array_equal(Landscape(plane_grid(1.0, 2), values).mean, [[2, 3], [4, 5]])
+def test_points_are_assigned_to_waypoints_by_their_distance_from_the_first():
+    grid = Grid(np.zeros(3), np.eye(3)[:2], (np.linspace(-3, 3, 7), np.linspace(-1, 1, 3)))
+    waypoints = np.array([[0.0, 0, 0], [1, 0, 0], [0, 3, 0]])
+    landscape = made(np.arange(3)[:, None, None] + np.zeros((3, 7, 3)), grid, waypoints=waypoints, reduce="assigned")
+    expected = [[2, 2, 2], [2, 1, 2], [1, 1, 1], [1, 0, 1], [1, 1, 1], [2, 1, 2], [2, 2, 2]]
+    expected[1][1] = expected[5][1] = 1  # 2 is as far from 1 as from 3: the first
+    np.testing.assert_array_equal(landscape.rings, expected)
+    np.testing.assert_array_equal(landscape.combined, expected)
+    each = np.broadcast_to(landscape.values[:, None], (3, 2, 7, 3)) + np.array([0, 10])[:, None, None]
+    kept = dataclasses.replace(landscape, values=each, rotations=np.stack([np.eye(3)] * 2), turned=None)
+    np.testing.assert_array_equal(kept.combined, [expected, np.add(expected, 10)])
 
 
-def test_another_grid_of_one_size_compiles_nothing(field, reference):
-    energy_landscape(field, reference, plane_grid(0.2, 3))
-    with compilations() as names:
-        energy_landscape(field, reference, plane_grid(0.4, 3, origin=(0.1, 0.0, 0.0), axes="yz"))
-    assert names == []
+def test_minimisers_pass_over_what_does_not_count():
+    grid = dataclasses.replace(plane_grid(1.0, 3), mask=np.array([[0, 1, 1], [1, 1, 1], [1, 1, 1]], bool))
+    values = np.full((2, 3, 3), 5.0)
+    values[:, 0, 0], values[0, 1, 2], values[1, 2, 0] = np.nan, 1, 2
+    landscape = made(values, grid)
+    np.testing.assert_allclose(landscape.minimisers, [[0, 1, 0], [1, -1, 0]])
+    assert np.isnan(landscape.combined[0, 0])
+
+
+@pytest.mark.parametrize("kind", ["best", "each", "masked"])
+def test_a_file_gives_the_same_landscape(tmp_path, kind):
+    rng = np.random.default_rng(0)
+    grid = path_grid(np.zeros((1, 3)), 0.1, 0.05) if kind == "masked" else volume_grid(0.1, 3, (0.1, 0.2, 0.3))
+    shape = (2, *((4,) if kind == "each" else ()), *grid.shape)
+    turned = None if kind == "each" else rng.integers(4, size=shape).astype(np.int32)
+    rotations = tdf.poses.rotation_grid(4)
+    first = Landscape(grid, rng.uniform(size=shape).astype(np.float32), rng.normal(size=(2, 3)), rotations, turned, "soft_least", 0.002)
+    save_landscape(tmp_path / "it.npz", first, {"seed": 3})
+    again, about = load_landscape(tmp_path / "it.npz")
+    assert about == {"seed": 3}
+    assert (again.reduce, again.temperature) == ("soft_least", 0.002)
+    for name in ("values", "waypoints", "rotations", "turned", "combined", "minimisers", "minimiser_rotations"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
+    np.testing.assert_array_equal(again.grid.points, grid.points)
+    np.testing.assert_array_equal(again.grid.mask, grid.mask)
+    assert again.values.dtype == np.float32
+    assert [file.name for file in tmp_path.iterdir()] == ["it.npz"]
+
+
+def test_files_that_hold_something_else_are_refused(tmp_path, landscape):
+    with pytest.raises(InputError, match="no file"):
+        load_landscape(tmp_path / "none.npz")
+    for name in ("it.npy", "it"):
+        with pytest.raises(InputError, match="ends in .npz"):
+            save_landscape(tmp_path / name, landscape)
+    path = tmp_path / "it.npz"
+    np.savez(path, values=landscape.values)
+    with pytest.raises(InputError, match="cannot read"):
+        load_landscape(path)
+    save_landscape(path, landscape)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="cannot read"):
+        load_landscape(path)
+    with np.load(io.BytesIO(whole)) as file:
+        arrays = dict(file)
+    np.savez(path, **arrays | {"header": np.array(str(arrays["header"]).replace('"format": 1', '"format": 9'))})
+    with pytest.raises(InputError, match="format 9; expected 1"):
+        load_landscape(path)
+    with pytest.raises(InputError, match="cannot write"):
+        save_landscape(tmp_path / "no folder" / "it.npz", landscape)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ({"half": 0.0}, "half is 0.0"),
-        ({"half": float("nan")}, "half is nan"),
-        ({"half": 1.0, "count": 1}, "count is 1"),
-        ({"half": 1.0, "count": 2.5}, "count is 2.5"),
-        ({"half": 1.0, "axes": "zx"}, "axes is 'zx'"),
-        ({"half": 1.0, "origin": (0.0, 1.0)}, "origin is"),
-    ],
+    ("changes", "words"),
+    [({"reduce": "median"}, "reduce is 'median'"), ({"temperature": 0.0}, "temperature is 0.0"), ({"turned": None}, "values have shape")],
 )
-def test_grids_that_make_no_sense_are_refused(arguments, words):
+def test_landscapes_that_make_no_sense_are_refused(landscape, changes, words):
     with pytest.raises(InputError, match=words):
-        plane_grid(**arguments)
-
-
-def test_what_does_not_fit_is_refused(field, reference):
-    with pytest.raises(InputError, match=r"rotation has shape \(7,\)"):
-        energy_landscape(field, reference, plane_grid(0.2, 3), jnp.zeros(7))
-    other = dataclasses.replace(reference, descriptors=reference.descriptors[..., :5])
-    with pytest.raises(InputError, match="same model"):
-        energy_landscape(field, other, plane_grid(0.2, 3))
+        dataclasses.replace(landscape, **changes)

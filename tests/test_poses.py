@@ -306,3 +306,33 @@ def group_laws(u, v, t):
 def test_group_axioms(u, v, t):
     for left, right in group_laws(jnp.array(u), jnp.array(v), jnp.array(t)):
         np.testing.assert_allclose(left, right, atol=2e-5)
+
+
+def test_a_grid_of_rotations_leaves_no_large_hole():
+    """Alexa's spiral: with 512, no rotation is farther than 30 degrees from one of them; random ones leave larger holes."""
+    grid = poses.rotation_grid(512)
+    np.testing.assert_allclose(grid @ grid.swapaxes(1, 2), np.broadcast_to(np.eye(3), grid.shape), atol=1e-5)
+    probes = np.asarray(poses.uniform_rotations(jax.random.key(0), 2000))
+
+    def hole(rotations):
+        traces = np.einsum("aij,bij->ab", probes, rotations).max(axis=1)
+        return np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1))).max()
+
+    assert hole(grid) < 30
+    assert hole(np.asarray(poses.uniform_rotations(jax.random.key(1), 512))) > 35
+
+
+def test_turns_go_once_around_an_axis():
+    turns = poses.turns((0, 0, 2), 4)
+    np.testing.assert_allclose(turns @ [1, 0, 0], [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], atol=1e-6)
+    start = poses.exp(jnp.array([0.3, 0.0, 0.0]))
+    np.testing.assert_allclose(poses.turns((0, 0, 1), 2, start)[0], start, atol=1e-6)
+
+
+def test_rotations_that_make_no_sense_are_refused():
+    with pytest.raises(InputError, match="count is 0"):
+        poses.rotation_grid(0)
+    with pytest.raises(InputError, match="axis is"):
+        poses.turns((0, 0, 0), 3)
+    with pytest.raises(InputError, match="count is 0"):
+        poses.turns((0, 0, 1), 0)

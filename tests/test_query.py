@@ -6,7 +6,7 @@ import pytest
 from scipy.stats import kstest
 
 from tdf_jax.errors import InputError
-from tdf_jax.query import box_query, gaussian_query, gripper_query, lattice_query
+from tdf_jax.query import box_query, gaussian_query, gripper_query, lattice_query, snapped_query
 
 KEY = jax.random.key(0)
 DRAWN = [box_query, gaussian_query, gripper_query]
@@ -117,3 +117,20 @@ def test_sizes_of_wrong_shape_are_refused():
     for shape in ((6, 6), (6, 6, 0), (6, 6, 1.5), 6):
         with pytest.raises(InputError, match="shape is .*; expected three whole numbers of at least 1"):
             lattice_query(shape)
+
+
+def test_snapped_points_lie_on_the_lattice_next_to_where_they_were():
+    query = gaussian_query(KEY, 50)
+    snapped = np.asarray(snapped_query(query, 0.01, centre=(0.001, 0.002, 0.003)))
+    nodes = (snapped - [0.001, 0.002, 0.003]) / 0.01
+    np.testing.assert_allclose(nodes, np.round(nodes), atol=1e-4)
+    assert np.abs(snapped - np.asarray(query)).max() <= 0.005 + 1e-7
+    regular = lattice_query((3, 3, 3), 0.01)
+    np.testing.assert_allclose(snapped_query(regular, 0.01), regular, atol=1e-8)
+
+
+def test_snapping_to_no_lattice_is_refused():
+    with pytest.raises(InputError, match="pitch is 0.0"):
+        snapped_query(np.zeros((2, 3)), 0.0)
+    with pytest.raises(InputError, match=r"shape \(3,\)"):
+        snapped_query(np.zeros(3), 0.01)

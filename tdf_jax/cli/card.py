@@ -33,7 +33,7 @@ def card(model: Model, outcomes: Outcomes, settings: dict) -> str:
     facts = {
         "network": f"Neural Descriptor Fields occupancy network, {sizes}",
         "trained by": model.info.source,
-        "input": f"a cloud of any density, thinned to {model.info.cloud_points} farthest points (`imitate` does it), any pose",
+        "input": f"a cloud of any density, thinned to {model.info.cloud_points} farthest points several times, latents averaged (`encode` does it), any pose",
     }
     if model.info.description:
         facts["notes"] = model.info.description

@@ -6,7 +6,6 @@ import numpy as np
 
 from tdf_jax import poses
 from tdf_jax.cli.scores import GENERATED, Outcomes
-from tdf_jax.demonstration import thinned
 from tdf_jax.errors import InputError
 from tdf_jax.evaluation.comparison import Outcome
 from tdf_jax.evaluation.transfer import QUERY_SIZE
@@ -59,7 +58,7 @@ def _panel(model: Model, outcome: Outcome, index: int) -> Panel:
         overlap="IoU n/a: not closed" if iou is None else f"IoU {iou:.2f}",
         error=f"{100 * outcome.distance[index]:.1f} cm, {outcome.angle[index]:.0f}° off",
         triangles=np.asarray(case.object_b.mesh.triangles),
-        found=reconstructed(encode(model, thinned(model, case.points_b)), T_world_b, case.object_b.mesh.bounds),
+        found=reconstructed(encode(model, case.points_b), T_world_b, case.object_b.mesh.bounds),
         T_object_true=np.linalg.inv(T_world_b) @ case.T_world_place_b,
         T_object_found=np.linalg.inv(T_world_b) @ T_world_found,
         size=QUERY_SIZE * case.scale,

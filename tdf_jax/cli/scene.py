@@ -1,11 +1,11 @@
-"""What `tdf imitate` works on: a demonstration and a target, from the user's files or a pair of generated mugs."""
+"""What `tdf imitate` and `tdf landscape` work on: a demonstration and a target, from the user's files or a pair of generated mugs."""
 
 import dataclasses
 
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from tdf_jax.cli.settings import Settings
+from tdf_jax.cli.settings import SceneSettings
 from tdf_jax.demonstration import Demonstration
 from tdf_jax.errors import InputError
 from tdf_jax.evaluation.cases import Case, mug_case, random_pose
@@ -22,7 +22,7 @@ PLACE = (0.0, 0.24, 0.18)  # metres from the pick: 0.30 m away, to the handle's 
 LIFT = (0.0, 0.0, 1.0)  # a semicircle and a wave leave the straight line upwards first
 
 
-def make_scene(settings: Settings, key: PRNGKeyArray) -> Scene:
+def make_scene(settings: SceneSettings, key: PRNGKeyArray) -> Scene:
     """Read or generate both objects.
 
     Args:
@@ -54,7 +54,7 @@ def make_scene(settings: Settings, key: PRNGKeyArray) -> Scene:
     )
 
 
-def _read_demonstration(settings: Settings) -> Demonstration | None:
+def _read_demonstration(settings: SceneSettings) -> Demonstration | None:
     if settings.demonstration is None:
         return None
     shown = load_demonstration(settings.demonstration)
@@ -63,7 +63,7 @@ def _read_demonstration(settings: Settings) -> Demonstration | None:
     return dataclasses.replace(shown, trajectory=resample(shown.trajectory, settings.poses))
 
 
-def _read_target(settings: Settings):
+def _read_target(settings: SceneSettings):
     """Points and, if it has faces, the mesh."""
     if settings.target is None:
         return None
@@ -74,7 +74,7 @@ def _read_target(settings: Settings):
         return points, None
 
 
-def _generated(settings: Settings, pair: Case, key: PRNGKeyArray) -> Demonstration:
+def _generated(settings: SceneSettings, pair: Case, key: PRNGKeyArray) -> Demonstration:
     pick = pair.T_world_place_a
     start, bow = pick[:3, 3], {} if settings.trajectory == "line" else {"bulge": LIFT}
     shape = SHAPES[settings.trajectory]

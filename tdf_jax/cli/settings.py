@@ -1,8 +1,8 @@
-"""Options of `tdf imitate`."""
+"""Options of `tdf imitate` and `tdf landscape`."""
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 import tyro
@@ -18,8 +18,8 @@ def _option(metavar: str | None = None, default: str | None = None):
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
-    """What to imitate, on what, and how.
+class SceneSettings:
+    """A demonstration and a new object, from files or generated.
 
     Attributes:
         target: mesh or point cloud of the new object.
@@ -27,49 +27,104 @@ class Settings:
         target_pose: how the target lies in the world: as its file says, or moved by a random rotation and translation.
         demonstration: .npz with points (N, 3), wxyz_xyz (n, 7) and query (Q, 3), in metres.
         trajectory: shape of a generated demonstration, from the handle to a place 0.30 m away.
-        goal_offset: metres in the world, added to where the last pose goes.
-        k: weight of the correlation term; the paper's best is 0.02.
-        inits: random starts.
         poses: of the trajectory; a demonstration file is resampled to another number.
         queries: query points of a generated demonstration.
-        iterations: optimisation steps.
         points: drawn from a mesh, or from a larger cloud.
         seed: of every draw.
         weights: a name of shipped weights, or a .safetensors file.
+    """
+
+    target: Annotated[Path | None, _option("FILE", "a generated mug")] = None
+    scale: float = 1.0
+    target_pose: Annotated[Literal["given", "random"] | None, _option(default="given for a file, random for a generated mug")] = None
+    demonstration: Annotated[Path | None, _option("FILE", "one on another generated mug")] = None
+    trajectory: Annotated[Literal["line", "semicircle", "wave"] | None, _option(default="wave")] = None
+    poses: Annotated[int | None, _option("INT", "7, or those of the demonstration file")] = None
+    queries: Annotated[int | None, _option("INT", "128")] = None
+    points: int = 1500
+    seed: int = 0
+    weights: Annotated[str, _option("NAME|FILE")] = "mug"
+
+    COMMAND: ClassVar[str] = "tdf"
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings(SceneSettings):
+    """What to imitate, on what, and how.
+
+    Attributes:
+        goal_offset: metres in the world, added to where the last pose goes.
+        k: weight of the correlation term; the paper's best is 0.02.
+        inits: random starts.
+        iterations: optimisation steps.
         out: folder to write; an earlier result there is replaced.
         no_plots: leave out imitation.png and loss.png.
         json: print result.json instead of the table.
     """
 
-    target: Annotated[Path | None, _option("FILE", "a generated mug")] = None
-    scale: float = 1.0
-    target_pose: Annotated[
-        Literal["given", "random"] | None, _option(default="given for a file, random for a generated mug")
-    ] = None
-    demonstration: Annotated[Path | None, _option("FILE", "one on another generated mug")] = None
-    trajectory: Annotated[Literal["line", "semicircle", "wave"] | None, _option(default="wave")] = None
     goal_offset: Annotated[tuple[float, float, float], _option("X Y Z")] = (0.0, 0.0, 0.0)
     k: float = 0.02
     inits: int = 10
-    poses: Annotated[int | None, _option("INT", "7, or those of the demonstration file")] = None
-    queries: Annotated[int | None, _option("INT", "128")] = None
     iterations: int = 100
-    points: int = 1500
-    seed: int = 0
-    weights: Annotated[str, _option("NAME|FILE")] = "mug"
     out: Annotated[Path, _option("DIR")] = Path("imitation")
     no_plots: bool = False
     json: bool = False
 
+    COMMAND: ClassVar[str] = "tdf imitate"
 
-def resolved(settings: Settings) -> Settings:
+
+@dataclasses.dataclass(frozen=True)
+class LandscapeSettings(SceneSettings):
+    """What to sweep the query frame over, and how.
+
+    Attributes:
+        target_pose: as its file says, or moved by a random rotation and translation.
+        grid: a plane of the orientation's axes through the demonstration's path, a volume about it, or the path's neighbourhood.
+        half: of the plane's or volume's side, metres.
+        radius: of the neighbourhood of a path, metres.
+        pitch: distance of neighbouring points, metres; the side is rounded to whole ones.
+        query: a lattice of the grid's pitch in the box of the demonstration's query points, or those points moved onto it, or as they
+            are: exact, and some thirty times slower.
+        rotation: of the query frame: the demonstration's at the pick, the world's axes (as in the paper), the best of many at every
+            point, or the pick's turned about an axis, the best at every point.
+        rotations: number of them for "best" and "turns".
+        axis: of "turns", in the world.
+        reduce: how the waypoints' energies are combined: the least, a soft least, each in its ring about the pick, or the mean.
+        sharpness: of the lowest-cost path from the pick to the goal: power of the energy that it adds up.
+        no_page: leave out landscape.html.
+        out: folder to write; an earlier result there is replaced.
+        no_plots: leave out all pictures and the page.
+        json: print result.json instead of the table.
+    """
+
+    target_pose: Annotated[Literal["given", "random"] | None, _option(default="given")] = None
+    grid: Literal["xy", "xz", "yz", "volume", "path"] = "yz"
+    half: float = 0.3
+    radius: float = 0.1
+    pitch: float = 0.012
+    query: Literal["lattice", "snapped", "given"] = "lattice"
+    rotation: Literal["pick", "identity", "best", "turns"] = "pick"
+    rotations: int = 24
+    axis: Annotated[tuple[float, float, float], _option("X Y Z")] = (0.0, 0.0, 1.0)
+    reduce: Literal["least", "soft_least", "assigned", "mean"] = "least"
+    sharpness: float = 1.0
+    no_page: bool = False
+    out: Annotated[Path, _option("DIR")] = Path("landscape")
+    no_plots: bool = False
+    json: bool = False
+
+    COMMAND: ClassVar[str] = "tdf landscape"
+
+
+def resolved(settings: SceneSettings) -> SceneSettings:
     """The settings with the defaults filled in that depend on others.
 
     Raises:
         InputError: a bad number, or options that contradict each other.
     """
     _check_numbers(settings)
-    pose = settings.target_pose or ("random" if settings.target is None else "given")
+    generated = "given" if isinstance(settings, LandscapeSettings) else "random"
+    pose = settings.target_pose or (generated if settings.target is None else "given")
     if settings.demonstration is None:
         return dataclasses.replace(
             settings,
@@ -80,16 +135,27 @@ def resolved(settings: Settings) -> Settings:
         )
     for name in ("trajectory", "queries"):
         if getattr(settings, name) is not None:
-            raise InputError(f"tdf imitate: --{name} is for a generated demonstration, and there is a file; drop one")
+            raise InputError(f"{settings.COMMAND}: --{name} is for a generated demonstration, and there is a file; drop one")
     return dataclasses.replace(settings, target_pose=pose)
 
 
-def _check_numbers(settings: Settings) -> None:
+def _check_numbers(settings: SceneSettings) -> None:
     if not 0 <= settings.seed < SEEDS:
-        raise InputError(f"tdf imitate: --seed is {settings.seed}; expected 0 to {SEEDS - 1}")
-    if not 0 <= settings.k < np.inf:
-        raise InputError(f"tdf imitate: --k is {settings.k}; expected a weight of 0 or more")
-    if not np.isfinite(settings.goal_offset).all():
-        raise InputError(f"tdf imitate: --goal-offset is {settings.goal_offset}; expected three finite numbers, metres")
+        raise InputError(f"{settings.COMMAND}: --seed is {settings.seed}; expected 0 to {SEEDS - 1}")
     if settings.target is None and settings.scale != 1:
-        raise InputError("tdf imitate: --scale is for a --target file; give one, or drop --scale")
+        raise InputError(f"{settings.COMMAND}: --scale is for a --target file; give one, or drop --scale")
+    if isinstance(settings, Settings):
+        if not 0 <= settings.k < np.inf:
+            raise InputError(f"tdf imitate: --k is {settings.k}; expected a weight of 0 or more")
+        if not np.isfinite(settings.goal_offset).all():
+            raise InputError(f"tdf imitate: --goal-offset is {settings.goal_offset}; expected three finite numbers, metres")
+    if isinstance(settings, LandscapeSettings):
+        for name in ("half", "radius", "pitch"):
+            if not 0 < getattr(settings, name) < np.inf:
+                raise InputError(f"tdf landscape: --{name} is {getattr(settings, name)}; expected a length above 0, metres")
+        if settings.grid != "path" and settings.half < settings.pitch / 2:
+            raise InputError(f"tdf landscape: --half is {settings.half}; expected at least half the pitch of {settings.pitch}: two points a side")
+        if not 0 <= settings.sharpness < np.inf:
+            raise InputError(f"tdf landscape: --sharpness is {settings.sharpness}; expected a number of 0 or more")
+        if settings.rotations < 1:
+            raise InputError(f"tdf landscape: --rotations is {settings.rotations}; expected at least 1")

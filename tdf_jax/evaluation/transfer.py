@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from tqdm import tqdm
 
 from tdf_jax import poses
-from tdf_jax.demonstration import Reference, thinned
+from tdf_jax.demonstration import Reference
 from tdf_jax.descriptor import pose_descriptor
 from tdf_jax.energy import EnergyWeights
 from tdf_jax.evaluation.cases import Case, Transfer
@@ -42,7 +42,7 @@ def transferred(
     found = []
     for index, case in enumerate(tqdm(cases, desc="transferring", disable=not progress)):
         reference = place_reference(model, case, box_query(query_key, count=QUERIES, size=QUERY_SIZE * case.scale))
-        field = encode(model, thinned(model, case.points_b))
+        field = encode(model, case.points_b)
         key = jax.random.fold_in(start_key, index)
         # Given as they are: drawn inside, every start's last pose, here its only one, would be set to the goal.
         starts = random_starts(key, field, reference, config.inits, config.start, config.start_radius)
@@ -62,7 +62,7 @@ def place_errors(
 
 def place_reference(model: Model, case: Transfer, query: Float[Array, "queries 3"]) -> Reference:
     """The demonstration of one pose: the query frame at the place on object a."""
-    field = encode(model, thinned(model, case.points_a))
+    field = encode(model, case.points_a)
     place = jnp.asarray(case.T_world_place_a, jnp.float32)
     T_world_query = poses.pose(place[:3, :3], place[:3, 3])
     shown = Trajectory(T_world_query[None]).shifted(-field.origin)
@@ -91,7 +91,7 @@ def overlaps(model: Model, cases: Sequence[Case], samples: int = 20_000, seed: i
         if true is None:
             ious.append(None)
             continue
-        field = encode(model, thinned(model, case.points_b))
+        field = encode(model, case.points_b)
         world = (x @ case.T_world_b[:3, :3].T + case.T_world_b[:3, 3]).astype(np.float32)
         found = np.asarray(_occupancy(field, world)) > 0.5
         ious.append(float(np.sum(found & true) / np.sum(found | true)))

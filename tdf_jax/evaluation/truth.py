@@ -72,13 +72,3 @@ def shape_error(found: Float[np.ndarray, "poses 3"], truth: Float[np.ndarray, "p
     values[-1] *= np.sign(np.linalg.det(left @ right))
     squared = np.sum(found**2) + np.sum(truth**2) - 2 * np.sum(values)
     return float(np.sqrt(max(squared, 0.0) / len(found)))
-
-
-def distance_from_polyline(points: Float[np.ndarray, "points 3"], corners: Float[np.ndarray, "poses 3"]) -> Float[np.ndarray, " points"]:
-    """Distance of points from the nearest point of the polyline through some corners, metres."""
-    points, corners = np.asarray(points, float), np.asarray(corners, float)
-    steps = np.diff(corners, axis=0)
-    squared = np.maximum(np.sum(steps**2, axis=1), np.finfo(float).tiny)  # a step of no length is its corner
-    along = np.clip(np.einsum("psx,sx->ps", points[:, None] - corners[:-1], steps) / squared, 0, 1)
-    nearest = corners[:-1] + along[..., None] * steps
-    return np.linalg.norm(points[:, None] - nearest, axis=-1).min(axis=1)

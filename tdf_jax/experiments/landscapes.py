@@ -7,11 +7,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from tdf_jax.demonstration import Reference, describe, thinned
+from tdf_jax.demonstration import Reference, describe
 from tdf_jax.experiments import setting as settings
 from tdf_jax.experiments.setting import SHAPES, Setting
-from tdf_jax.landscape import Landscape, energy_landscape, plane_grid
+from tdf_jax.grid import plane_grid
 from tdf_jax.model import Model, encode
+from tdf_jax.sweep import energy_landscape
 from tdf_jax.trajectory import Trajectory
 
 HALF = 1.2  # of the square's side, in the paper's unit
@@ -66,7 +67,7 @@ def figure2(model: Model, base: Setting, field: str, count: int = 101) -> dict[s
     degrees = (UPRIGHT_TURN if base.turn == "any" else base.turn) if turn else 0.0
     R = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
     points = ((scene.points if which else scene.demonstration.points) @ R.T).astype(np.float32)
-    seen = encode(model, thinned(model, points))
+    seen = encode(model, points)
     # The paths are relative to the clouds' centres, as in the losses: on another mug they lie where its centre takes them.
     paths = {name: np.asarray(reference.trajectory.translations + seen.origin) for name, reference in references.items()}
     pick, orientation = paths["line"][0], references["line"].trajectory.rotations[0]
@@ -76,11 +77,12 @@ def figure2(model: Model, base: Setting, field: str, count: int = 101) -> dict[s
         return (np.asarray(x) - pick)[..., :2] / base.unit
 
     panels = {}
-    for name, values in zip(SHAPES, np.split(swept.values, len(SHAPES))):
-        landscape = Landscape(swept.grid, values)
+    for name, part in zip(SHAPES, np.split(np.arange(len(swept.values)), len(SHAPES))):
+        fields = {field: getattr(swept, field)[part] for field in ("values", "waypoints", "turned")}
+        landscape = dataclasses.replace(swept, **fields, reduce=base.field_energy)
         panels[name] = Swept(
             *(steps / base.unit for steps in swept.grid.coordinates),
-            energies=getattr(landscape, base.field_energy),
+            energies=landscape.combined,
             path=flat(paths[name]),
             carried=flat((paths[name] - seen.origin) @ R.T + seen.origin),
             minimisers=flat(landscape.minimisers),

@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from tdf_jax.demonstration import describe, thinned
+from tdf_jax.demonstration import describe
 from tdf_jax.energy import descriptor_loss, trajectory_energy
-from tdf_jax.evaluation.truth import FLIP_DEGREES, distance_from_polyline, pose_error, shape_error
+from tdf_jax.evaluation.truth import FLIP_DEGREES, pose_error, shape_error
 from tdf_jax.experiments import setting as settings
 from tdf_jax.experiments.setting import Setting
+from tdf_jax.grid import distance_from_polyline
 from tdf_jax.model import Model, encode
 from tdf_jax.optimize import optimize
 
@@ -114,7 +115,7 @@ def imitation(model: Model, setting: Setting) -> Run:
     """
     scene = settings.scene(setting)
     reference = describe(model, scene.demonstration)
-    field = encode(model, thinned(model, scene.points))
+    field = encode(model, scene.points)
     goal = settings.goal(setting, field, reference)
     reference = settings.aim(setting, reference)
     key = jax.random.fold_in(jax.random.key(setting.seed), settings.STREAM + 1)

@@ -18,7 +18,7 @@ from tdf_jax.experiments.setting import SHAPES, Setting
 from tdf_jax.files import replace_file
 from tdf_jax.model import Model
 
-FORMAT = 1  # of the files, and of what they hold: raised when a run is computed otherwise
+FORMAT = 2  # of the files, and of what they hold: raised when a run is computed otherwise
 
 
 class Store:

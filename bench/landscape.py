@@ -1,0 +1,133 @@
+"""Energy landscapes: a lattice's shared sweep against one evaluation for each (grid point, query point), in one run, alternating.
+
+    python -m bench.landscape              # the plane: 101 x 101 points 12 mm apart, 6 x 6 x 7 query points, 7 waypoints
+    python -m bench.landscape --volume     # and the volume: 64^3 points over +-0.3 m, shared only
+
+Both sweeps share each evaluation between waypoints and use the same sums; compilation is apart.
+"""
+
+import argparse
+import json
+import os
+import platform
+import resource
+import statistics
+import time
+
+import jax
+import numpy as np
+
+import tdf_jax as tdf
+from tdf_jax import lattice
+from tdf_jax.evaluation.cases import mug_of
+
+HALF, COUNT, PITCH, LATTICE, POSES = 0.6, 101, 0.012, (6, 6, 7), 7
+VOLUME_HALF, VOLUME_COUNT = 0.3, 64
+
+
+def case(pitch: float):
+    """A field and a reference: a wave from one generated mug's handle, on another mug."""
+    model = tdf.load_model("mug")
+    shown, new = (mug_of(0, which, 0.12) for which in (0, 1))
+    start = shown.handle_frame[:3, 3]
+    path = tdf.wave(POSES, start=start, end=start + [0.0, 0.3, 0.0])
+    query = tdf.lattice_query(LATTICE, pitch)
+    demonstration = tdf.Demonstration(tdf.sample_surface(shown.mesh, 1500, 0).astype(np.float32), path, query)
+    field = tdf.encode(model, tdf.sample_surface(new.mesh, 1500, 1).astype(np.float32))
+    return field, tdf.describe(model, demonstration), start
+
+
+def timed(field, reference, grid, share):
+    """Seconds of a sweep, and its energies."""
+    began = time.perf_counter()
+    values = tdf.energy_landscape(field, reference, grid, share=share).values
+    return time.perf_counter() - began, values
+
+
+def machine() -> dict:
+    """What it ran on, and how busy that was."""
+    return {
+        "cpu": platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+        "load": round(os.getloadavg()[0], 2),
+        "jax": jax.__version__,
+        "device": jax.devices()[0].device_kind,
+    }
+
+
+def plane(repetitions: int) -> dict:
+    """The shared sweep and the direct one of the plane."""
+    field, reference, start = case(PITCH)
+    grid = tdf.plane_grid(HALF, COUNT, start)
+    counts = {
+        share: lattice.evaluations(grid, lattice.layers(grid, np.asarray(reference.query), share)) for share in (True, False)
+    }
+    times, values = {True: [], False: []}, {}
+    first = {share: timed(field, reference, grid, share)[0] for share in (True, False)}
+    for _ in range(repetitions):
+        for share in (True, False):
+            seconds, values[share] = timed(field, reference, grid, share)
+            times[share].append(seconds)
+    medians = {share: statistics.median(times[share]) for share in times}
+    return {
+        "points": list(grid.shape),
+        "queries": len(reference.query),
+        "waypoints": POSES,
+        "evaluations": {"shared": counts[True], "direct": counts[False], "one_by_one": int(np.prod(grid.shape)) * len(reference.query)},
+        "seconds": {"shared": times[True], "direct": times[False], "first": {"shared": first[True], "direct": first[False]}},
+        "evaluations_ratio": counts[False] / counts[True],
+        "time_ratio": medians[False] / medians[True],
+        "largest_relative_difference": float(np.abs(values[True] / values[False] - 1).max()),
+    }
+
+
+def volume() -> dict:
+    """The shared sweep of the volume."""
+    pitch = 2 * VOLUME_HALF / (VOLUME_COUNT - 1)
+    field, reference, start = case(pitch)
+    grid = tdf.volume_grid(VOLUME_HALF, VOLUME_COUNT, start)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    seconds, _ = timed(field, reference, grid, True)
+    found = lattice.layers(grid, np.asarray(reference.query))
+    return {
+        "points": list(grid.shape),
+        "evaluations": lattice.evaluations(grid, found),
+        "one_by_one": int(np.prod(grid.shape)) * len(reference.query),
+        "seconds_with_compilation": seconds,
+        "peak_megabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_megabytes_before": before / 1024,
+    }
+
+
+def main() -> None:
+    """Measure and print; JSON with --json."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repetitions", type=int, default=3)
+    parser.add_argument("--volume", action="store_true", help="the volume too")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    record = {"machine": machine(), "plane": plane(options.repetitions)}
+    if options.volume:
+        record["volume"] = volume()
+    if options.json:
+        print(json.dumps(record, indent=1))
+        return
+    print("machine:", ", ".join(f"{name} {value}" for name, value in record["machine"].items()))
+    found = record["plane"]
+    for name in ("shared", "direct"):
+        spread = ", ".join(f"{seconds:.2f}" for seconds in found["seconds"][name])
+        print(f"plane, {name}: {found['evaluations'][name]:,} evaluations, {spread} s (first call {found['seconds']['first'][name]:.2f})")
+    print(
+        f"plane: {found['evaluations_ratio']:.1f} x fewer evaluations, {found['time_ratio']:.1f} x less time, "
+        f"energies differ by at most {found['largest_relative_difference']:.1e} of themselves"
+    )
+    if options.volume:
+        found = record["volume"]
+        print(
+            f"volume: {found['evaluations']:,} evaluations (one by one {found['one_by_one']:,}), {found['seconds_with_compilation']:.1f} s with "
+            f"compilation, peak {found['peak_megabytes']:.0f} MB ({found['peak_megabytes_before']:.0f} before)"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,222 @@
+"""`tdf landscape`: energies over a grid, from files or a pair of generated mugs to a folder of results."""
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import math
+import shutil
+import time
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from tdf_jax import lattice, poses
+from tdf_jax.checkpoint import load_model
+from tdf_jax.cli.scene import make_scene
+from tdf_jax.cli.settings import LandscapeSettings, resolved
+from tdf_jax.demonstration import Reference, describe
+from tdf_jax.errors import InputError
+from tdf_jax.evaluation.scene import Scene
+from tdf_jax.field import DescriptorField
+from tdf_jax.files import replace_file, replace_folder
+from tdf_jax.grid import PLANES, Grid, distance_from_polyline, path_grid, plane_grid, volume_grid
+from tdf_jax.landscape import Landscape, load_landscape, save_landscape
+from tdf_jax.model import encode
+from tdf_jax.optimize import default_goal
+from tdf_jax.query import lattice_query, snapped_query
+from tdf_jax.route import lowest_cost_path
+from tdf_jax.sweep import blank, fill, query_change
+
+RESULT = "result.json"
+NAMES = (RESULT, "landscape.npz", "map.png", "isosurface.png", "slices.gif", "landscape.html")
+SCHEMA = 1  # raised when a field of result.json changes its meaning or goes
+STREAM = 0x1A2D5CA9  # folded into the seed's key
+SAVE_SECONDS = 20.0  # between saves of an unfinished sweep
+NUMBER = 4  # bytes
+
+
+def landscape(settings: Annotated[LandscapeSettings, tyro.conf.arg(name="")] = LandscapeSettings()) -> None:
+    """Sweep the query frame over a grid: where does each waypoint's descriptor find its like?
+
+    Writes a folder with result.json, landscape.npz, pictures and a page to turn by hand. A sweep that is interrupted is kept beside it and
+    goes on when the same command is run again.
+    """
+    settings = resolved(settings)
+    began = time.perf_counter()
+    model = load_model(settings.weights)
+    scene = make_scene(settings, jax.random.fold_in(jax.random.key(settings.seed), STREAM))
+    field = encode(model, scene.points)
+    given = describe(model, scene.demonstration)
+    waypoints = np.asarray(given.trajectory.translations + field.origin, dtype=float)
+    rotations = _rotations(settings, np.asarray(given.trajectory.rotations[0], dtype=float))
+    axes = rotations[0].T if settings.rotation in ("pick", "identity") else np.eye(3)
+    _check_size(settings, waypoints, given.trajectory.poses)
+    grid = _grid(settings, waypoints, axes)
+    query = _query(settings, np.asarray(scene.demonstration.query))
+    demonstration = dataclasses.replace(scene.demonstration, query=query)
+    reference = given if settings.query == "given" else describe(model, demonstration)
+    with replace_folder("tdf landscape", settings.out, RESULT, NAMES) as folder:
+        found = _swept(settings, field, reference, grid, rotations)
+        seconds = {"sweep": time.perf_counter() - began}
+        goal = default_goal(field, given)
+        expected = scene.expected(goal)
+        expected = None if expected is None else np.asarray(expected.translations, dtype=float)
+        path = lowest_cost_path(found, *_ends(grid, waypoints[0] if expected is None else expected[0], np.asarray(goal[4:])), settings.sharpness)
+        change = None if settings.query == "given" else query_change(field, given, reference, grid, rotations[0])
+        if not settings.no_plots:
+            _draw(settings, folder, scene, found, expected, path)
+        seconds["total"] = time.perf_counter() - began
+        record = _record(settings, found, reference, change, waypoints, expected, path, seconds)
+        save_landscape(folder / "landscape.npz", found, {"settings": record["settings"]})
+        replace_file("tdf landscape", folder / RESULT, json.dumps(record, indent=1).encode())
+    _unfinished(settings).unlink(missing_ok=True)
+    print(json.dumps(record, indent=1) if settings.json else _table(record, settings.out))
+
+
+def _rotations(settings, at_pick):
+    """R_world_query of the sweep, (rotations, 3, 3)."""
+    if settings.rotation == "best":
+        return poses.rotation_grid(settings.rotations)
+    if settings.rotation == "turns":
+        return poses.turns(settings.axis, settings.rotations, at_pick)
+    return np.eye(3)[None] if settings.rotation == "identity" else at_pick[None]
+
+
+def _grid(settings, waypoints, axes) -> Grid:
+    if settings.grid == "path":
+        return path_grid(waypoints, settings.radius, min(settings.pitch, settings.radius))
+    count = round(2 * settings.half / settings.pitch) + 1
+    half = settings.pitch * (count - 1) / 2
+    middle = (waypoints.min(axis=0) + waypoints.max(axis=0)) / 2
+    if settings.grid == "volume":
+        return volume_grid(half, count, middle, axes)
+    return plane_grid(half, count, middle, axes[["xyz".index(axis) for axis in settings.grid]])
+
+
+def _check_size(settings, waypoints, count) -> None:
+    """Refuse what would not fit on the disk, before any work."""
+    sides = np.full(3, 2 * settings.half) if settings.grid != "path" else np.ptp(waypoints, axis=0) + 2 * settings.radius
+    points = math.prod(float(side) / settings.pitch + 1 for side in sides[: 2 if settings.grid in PLANES else 3])
+    needed = points * NUMBER * 2 * count * 2  # energies and rotations, unfinished and finished
+    parent = settings.out.resolve().parent
+    free = shutil.disk_usage(parent).free if parent.is_dir() else math.inf
+    if needed > free:
+        raise InputError(
+            f"tdf landscape: {points:.3g} points with {count} waypoints need {needed / 1e9:.3g} GB, and {parent} has {free / 1e9:.3g} GB free; "
+            "expected a grid that fits: raise --pitch or lower --half"
+        )
+
+
+def _query(settings, query):
+    """The query points of the sweep: nodes of the grid's lattice, if wanted."""
+    if settings.query == "given":
+        return query
+    low, high = query.min(axis=0), query.max(axis=0)
+    shape = [max(1, round(float(side) / settings.pitch) + 1) for side in high - low]
+    # The lattice lies along the query frame's axes, and so do the grid's where there is one orientation.
+    if settings.query == "snapped":
+        return np.asarray(snapped_query(query, settings.pitch, (low + high) / 2))
+    return np.asarray(lattice_query(shape, settings.pitch, (low + high) / 2))
+
+
+def _swept(settings, field: DescriptorField, reference: Reference, grid: Grid, rotations) -> Landscape:
+    """The landscape, from where an interrupted sweep of the same stood."""
+    file, digest = _unfinished(settings), _digest(field, reference, grid, rotations)
+    found, done = blank(field, reference, grid, rotations, settings.reduce), 0
+    if file.exists():
+        kept, about = load_landscape(file)
+        if about.get("digest") != digest:
+            raise InputError(
+                f"tdf landscape: {file} is an unfinished sweep with other settings; expected the same ones to go on: give another --out, or "
+                "delete it"
+            )
+        found, done = dataclasses.replace(kept, reduce=settings.reduce), about["done"]
+    saved = time.monotonic()
+    with contextlib.closing(fill(found, field, reference, done)) as parts, tqdm(desc="sweeping", unit="tile", initial=done) as bar:
+        try:
+            for done, total in parts:
+                bar.total = total
+                bar.update(done - bar.n)
+                if time.monotonic() - saved > SAVE_SECONDS and done < total:
+                    save_landscape(file, found, {"digest": digest, "done": done})
+                    saved = time.monotonic()
+        except KeyboardInterrupt:
+            save_landscape(file, found, {"digest": digest, "done": done})
+            raise
+    return found
+
+
+def _unfinished(settings) -> Path:
+    return settings.out.resolve().with_name(f"{settings.out.resolve().name}.unfinished.npz")
+
+
+def _digest(field, reference, grid, rotations) -> str:
+    """What the energies are a function of."""
+    leaves = [*jax.tree.leaves((field, reference)), grid.origin, grid.directions, *grid.coordinates, rotations]
+    return hashlib.sha256(b"".join(np.ascontiguousarray(leaf).tobytes() for leaf in leaves)).hexdigest()[:16]
+
+
+def _ends(grid, start, goal):
+    """Start and goal moved to the nearest point of the grid, which may be a plane that passes them by."""
+    points = grid.points[np.ones(grid.shape, bool) if grid.mask is None else grid.mask]
+    return [points[np.linalg.norm(points - end, axis=1).argmin()] for end in (start, goal)]
+
+
+def _draw(settings, folder: Path, scene: Scene, found: Landscape, expected, path) -> None:
+    from tdf_jax.viz import terrain
+    from tdf_jax.viz.style import save_figure
+
+    marks = terrain.Marks(np.asarray(scene.points), scene.meshes[1], expected, path)
+    if len(found.grid.shape) == 2:
+        save_figure(folder / "map.png", terrain.map_figure(found, marks))
+    else:
+        save_figure(folder / "isosurface.png", terrain.isosurface_figure(found, marks))
+        terrain.save_slices(folder / "slices.gif", found, marks)
+    if not settings.no_page:
+        terrain.save_page(folder / "landscape.html", found, marks, "Energy landscape")
+
+
+def _record(settings, found: Landscape, reference, change, waypoints, expected, path, seconds) -> dict:
+    """Everything about a sweep that result.json holds."""
+    query = np.asarray(reference.query, dtype=float)
+    layers = [lattice.layers(found.grid, query @ R.T) for R in found.rotations]
+    truth = waypoints if expected is None else expected
+    return {
+        "schema": SCHEMA,
+        "settings": {name: str(value) if isinstance(value, Path) else value for name, value in dataclasses.asdict(settings).items()},
+        "grid": {"shape": found.grid.shape, "steps": found.grid.steps.tolist(), "first": found.grid.first.tolist()},
+        "queries": len(query),
+        "rotations": len(found.rotations),
+        "evaluations": sum(lattice.evaluations(found.grid, each) for each in layers),
+        "one_by_one": math.prod(found.grid.shape) * len(query) * len(found.rotations),
+        "query_change": None if change is None else {"median": change[0], "largest": change[1]},
+        "energy": {"least": float(np.nanmin(found.combined)), "median": float(np.nanmedian(found.combined))},
+        "minimisers": found.minimisers.tolist(),
+        "truth": None if expected is None else expected.tolist(),
+        "minimiser_metres": np.linalg.norm(found.minimisers - truth, axis=1).tolist(),
+        "path": path.tolist(),
+        "path_metres": float(distance_from_polyline(path, truth).mean()),
+        "seconds": {name: round(value, 3) for name, value in seconds.items()},
+    }
+
+
+def _table(record: dict, out: Path) -> str:
+    """The record in a few lines."""
+    against = "the true waypoints" if record["truth"] is not None else "the demonstration's, moved with the centroid"
+    change = record["query_change"]
+    rows = {
+        "grid": " x ".join(map(str, record["grid"]["shape"])) + f" points, {record['queries']} queries, {record['rotations']} orientations",
+        "evaluations": f"{record['evaluations']:,} of the field; one by one {record['one_by_one']:,}",
+        "lattice": "none" if change is None else f"changes the energy by {change['median']:.1%} (median), {change['largest']:.1%} (most)",
+        "energy": f"least {record['energy']['least']:.5f}, median {record['energy']['median']:.5f}",
+        "minimisers": ", ".join(f"{100 * metres:.1f}" for metres in record["minimiser_metres"]) + f" cm from {against}",
+        "lowest-cost path": f"{100 * record['path_metres']:.1f} cm from the polyline through them, mean",
+        "time": f"{record['seconds']['total']:.1f} s, sweep {record['seconds']['sweep']:.1f}",
+        "written to": str(out),
+    }
+    return "\n".join(f"{name:<17}{value}" for name, value in rows.items())
