@@ -11,7 +11,7 @@ from tdf_jax.trajectory import Trajectory
 
 PLANES = ("xy", "xz", "yz")
 SQUARE = 1e-6  # how far from perpendicular unit vectors directions may be: float32 rotations are 1e-7 off
-EVEN = 1e-6  # how far steps may differ, of the step
+EVEN = 1e-6  # how far coordinates may be from even steps, of the largest: float32's rounding is 6e-8
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -52,13 +52,15 @@ class Grid:
             step = (steps[-1] - steps[0]) / (len(steps) - 1)
             if not 0 < step < np.inf:
                 raise InputError(f"Grid(): the {name} axis goes from {steps[0]} to {steps[-1]}; expected it to increase")
-            if not np.allclose(np.diff(steps), step, rtol=EVEN, atol=0):
+            if np.abs(steps - np.linspace(steps[0], steps[-1], len(steps))).max() > EVEN * np.abs(steps).max():
                 raise InputError(f"Grid(): the steps of the {name} axis differ; expected even ones, as of np.linspace")
-        for name, value in (("origin", origin), ("directions", directions), ("coordinates", axes)):
+        axes = tuple(np.linspace(steps[0], steps[-1], len(steps)) for steps in axes)
+        mask = None if self.mask is None else np.asarray(self.mask, dtype=bool)
+        for name, value in (("origin", origin), ("directions", directions), ("coordinates", axes), ("mask", mask)):
             object.__setattr__(self, name, value)
-        if self.mask is not None and (np.shape(self.mask) != self.shape or not np.any(self.mask)):
+        if mask is not None and (mask.shape != self.shape or not mask.any()):
             raise InputError(
-                f"Grid(): mask has shape {np.shape(self.mask)} and {np.count_nonzero(self.mask)} points; expected {self.shape} and at least one"
+                f"Grid(): mask has shape {mask.shape} and {np.count_nonzero(mask)} points; expected {self.shape} and at least one"
             )
 
     @property
@@ -128,13 +130,16 @@ def volume_grid(
     return Grid(_point("volume_grid", origin), np.eye(3) if axes is None else np.asarray(axes), (steps, steps, steps))
 
 
-def path_grid(path: Trajectory | Float[np.ndarray, "poses 3"], radius: float, step: float) -> Grid:
-    """The neighbourhood of a path: points of a lattice along the world's axes, through its first corner, that lie within a distance of it.
+def path_grid(
+    path: Trajectory | Float[np.ndarray, "poses 3"], radius: float, step: float, axes: Float[np.ndarray, "3 3"] | None = None
+) -> Grid:
+    """The neighbourhood of a path: points of a lattice through its first corner that lie within a distance of it.
 
     Args:
         path: a trajectory, or the corners of a polyline, metres, world frame.
         radius: of the neighbourhood, metres.
         step: between points, metres; at most the radius.
+        axes: directions of the lattice; by default the world's axes.
 
     Raises:
         InputError: a radius or a step that is not positive, a step above the radius, or a path that is none.
@@ -144,10 +149,12 @@ def path_grid(path: Trajectory | Float[np.ndarray, "poses 3"], radius: float, st
         raise InputError(f"path_grid(): the path has shape {corners.shape}; expected finite corners (poses, 3), metres")
     if not 0 < step <= radius < np.inf:
         raise InputError(f"path_grid(): step is {step} and radius {radius}; expected 0 < step <= radius, metres")
-    low, high = ((bound(corners, axis=0) - corners[0]) / step for bound in (np.min, np.max))
+    axes = np.eye(3) if axes is None else np.asarray(axes, dtype=float)
+    along = (corners - corners[0]) @ axes.T / step
+    low, high = along.min(axis=0), along.max(axis=0)
     reach = radius / step
     coordinates = tuple(step * np.arange(np.ceil(a - reach), np.floor(b + reach) + 1) for a, b in zip(low, high))
-    grid = Grid(corners[0], np.eye(3), coordinates)
+    grid = Grid(corners[0], axes, coordinates)
     near = distance_from_polyline(grid.points.reshape(-1, 3), corners) <= radius
     return dataclasses.replace(grid, mask=near.reshape(grid.shape))
 

@@ -56,8 +56,16 @@ def layers(grid: Grid, offsets: Float[np.ndarray, "queries 3"], share: bool = Tr
     Args:
         grid: whose steps count.
         offsets: of the query points from the query frame's origin, world axes, metres.
-        share: False gives each a layer of its own.
+        share: False gives each a layer of its own; so does a query that spans so many steps that sharing would evaluate more.
     """
+    alone = _grouped(grid, offsets, share=False)
+    if not share:
+        return alone
+    shared = _grouped(grid, offsets, share=True)
+    return min(shared, alone, key=lambda found: evaluations(grid, found))
+
+
+def _grouped(grid, offsets, share):
     offsets = np.asarray(offsets, dtype=float)
     steps = grid.steps
     along = offsets @ grid.directions.T / steps
@@ -122,9 +130,9 @@ def _tile_shape(shape, span):
 
 def evaluations(grid: Grid, found: Layers) -> int:
     """Points of the field that a sweep of these layers evaluates."""
-    size = [stop - start for start, stop in zip(*tiles(grid, found.span)[0])]
-    nodes = math.prod(part + extra for part, extra in zip(size, found.span))
-    return len(tiles(grid, found.span)) * len(found.offsets) * nodes
+    cover = tiles(grid, found.span)
+    nodes = math.prod(stop - start + extra for start, stop, extra in zip(*cover[0], found.span))
+    return len(cover) * len(found.offsets) * nodes
 
 
 def swept(
@@ -175,7 +183,9 @@ def swept(
 def _tile(field, references, axes, shifts, first, bases, size, span):
     """Sums of absolute differences (poses, *size); see `swept` for the arguments."""
     nodes = tuple(part + extra for part, extra in zip(size, span))
-    places = jnp.stack(jnp.meshgrid(*(jnp.arange(count, dtype=axes.dtype) for count in nodes), indexing="ij"), axis=-1) @ axes
+    numbers = jnp.meshgrid(*(jnp.arange(count, dtype=axes.dtype) for count in nodes), indexing="ij")
+    # Written out: a matrix product may round to fewer digits on an accelerator.
+    places = sum(number[..., None] * axis for number, axis in zip(numbers, axes))
     blocks, _, unrolled, poses = references.shape
 
     def layer(sums, one):

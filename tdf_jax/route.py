@@ -10,6 +10,8 @@ from scipy.sparse.csgraph import dijkstra
 from tdf_jax.errors import InputError
 from tdf_jax.landscape import Landscape
 
+SHARPEST = 50.0  # energies differ by a factor of 10 or so: costs then span as many decades, and float64 holds 300
+
 
 def lowest_cost_path(
     landscape: Landscape, start: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"], sharpness: float = 1.0
@@ -17,24 +19,24 @@ def lowest_cost_path(
     """The path from start to goal along which the integral of energy^sharpness over length is least.
 
     Dijkstra's algorithm (scipy) over the points that count, each joined to all its neighbours, diagonal ones included; a step costs its
-    length times the mean of both ends' energy^sharpness. A step of the grid is the resolution, and directions are multiples of 45 degrees.
+    length times the mean of both ends' energy^sharpness. About 1 kB of memory a point. A step of the grid is the resolution, and directions are multiples of 45 degrees.
 
     Args:
         landscape: in one orientation, or the best of several.
         start, goal: metres, world frame; the path goes between the grid's points nearest to them.
-        sharpness: 0 gives the shortest path; the larger, the more of a detour a valley is worth.
+        sharpness: 0 to 50; 0 gives the shortest path; the larger, the more of a detour a valley is worth.
 
     Returns:
         Points of the grid from start to goal, metres, world frame.
 
     Raises:
         InputError: each rotation's energies were kept, an end is no point or lies more than a step outside the grid, the sharpness is
-            negative, or the points that count do not join both ends.
+            not in 0 to 50, or the points that count do not join both ends.
     """
     if landscape.turned is None:
         raise InputError("lowest_cost_path(): the landscape keeps each rotation's energies; expected the best, or one rotation's")
-    if not 0 <= sharpness < np.inf:
-        raise InputError(f"lowest_cost_path(): sharpness is {sharpness}; expected a number of 0 or more")
+    if not 0 <= sharpness <= SHARPEST:
+        raise InputError(f"lowest_cost_path(): sharpness is {sharpness}; expected 0 to {SHARPEST:g}")
     grid, energy = landscape.grid, landscape.combined
     points = grid.points.reshape(-1, 3)
     counts = np.isfinite(energy)

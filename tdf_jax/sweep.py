@@ -35,7 +35,7 @@ def energy_landscape(
 
     A point of the field is evaluated once for all waypoints, and once for all query points that meet there: where the query is a lattice
     with the grid's steps along the grid's axes (`lattice_query`, `snapped_query`), tens of times less work than one by one. The memory at
-    work does not grow with the grid.
+    work does not grow with the grid, only with the references: 8 kB for each query point and waypoint, twice.
 
     Args:
         field: the object's.
@@ -83,8 +83,9 @@ def blank(
     if rotations.shape[-2:] != (3, 3) or rotations.ndim not in (2, 3) or not len(rotations):
         raise InputError(f"energy_landscape(): rotation has shape {rotations.shape}; expected (3, 3), or several (rotations, 3, 3)")
     rotations = rotations.reshape(-1, 3, 3)
-    if not np.allclose(rotations @ rotations.swapaxes(1, 2), np.eye(3), atol=ORTHOGONAL):
-        raise InputError("energy_landscape(): rotation holds matrices that are no rotations; expected R R^T = I")
+    square = np.allclose(rotations @ rotations.swapaxes(1, 2), np.eye(3), atol=ORTHOGONAL)
+    if not square or (np.linalg.det(rotations) < 0).any():
+        raise InputError("energy_landscape(): rotation holds matrices that are no rotations; expected R R^T = I and no mirror image")
     count = len(reference.descriptors)
     shape = (count, *(() if over_rotations == "best" else (len(rotations),)), *grid.shape)
     waypoints = np.asarray(reference.trajectory.translations + field.origin)
@@ -113,6 +114,8 @@ def fill(
     Yields:
         The number of parts done and of all: tiles of the grid, one rotation after the other.
     """
+    if devices is not None and not len(devices):
+        raise InputError("energy_landscape(): devices is empty; expected at least one, or None for the default")
     grid, query = landscape.grid, np.asarray(reference.query, dtype=float)
     found = [lattice.layers(grid, query @ R.T, share) for R in landscape.rotations]
     cover = [lattice.tiles(grid, each.span) for each in found]
@@ -136,7 +139,8 @@ def _keep(landscape, index, part, values):
         return
     kept, turned = landscape.values[:, *part], landscape.turned[:, *part]
     better = ~(kept <= values)  # also where there is none yet
-    kept[better], turned[better] = values[better], index
+    turned[better] = index  # first: interrupted here, the point would be entered again, with its rotation
+    kept[better] = values[better]
 
 
 def query_change(

@@ -54,6 +54,17 @@ def test_a_neighbourhood_is_the_points_near_a_path():
     assert abs(grid.mask.sum() * 0.01**3 / tube - 1) < 0.1
 
 
+def test_a_neighbourhood_may_have_axes_of_its_own():
+    corners = np.array([[0.0, 0, 0], [0.1, 0.2, 0], [0.2, 0.1, 0.1]])
+    turned = path_grid(corners @ TILTED, 0.05, 0.02, TILTED)  # the corners' coordinates along the axes are as before
+    np.testing.assert_allclose(turned.points @ TILTED.T, path_grid(corners, 0.05, 0.02).points, atol=1e-9)
+
+
+def test_single_precision_is_even_enough():
+    grid = Grid(np.zeros(3), np.eye(3)[:1], (np.linspace(-0.6, 0.6, 101, dtype=np.float32),))
+    np.testing.assert_allclose(grid.steps, 0.012, rtol=1e-6)
+
+
 def test_a_trajectory_has_a_neighbourhood():
     path = tdf.line(3, start=(0, 0, 0), end=(0.3, 0, 0))
     np.testing.assert_array_equal(path_grid(path, 0.05, 0.02).mask, path_grid(np.asarray(path.translations), 0.05, 0.02).mask)

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -119,6 +120,73 @@ def test_an_interrupted_sweep_goes_on(sweep, tmp_path, monkeypatch, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
+@pytest.mark.parametrize("changed", [("--radius", "0.09"), ("--query", "snapped"), ("--rotation", "best")])
+def test_another_sweep_does_not_go_on(sweep, tmp_path, monkeypatch, capsys, changed):
+    """Each of these leaves the field as it was, and the first the grid's coordinates."""
+    true_fill = command.fill
+
+    def stopping(*arguments):
+        yield next(true_fill(*arguments))
+        raise KeyboardInterrupt
+
+    first = ("--grid", "path", "--radius", "0.075") if "--radius" in changed else ("--rotation", "turns", "--rotations", 2)
+    monkeypatch.setattr(command, "fill", stopping)
+    with pytest.raises(SystemExit):
+        sweep(*first)
+    with pytest.raises(SystemExit) as stop:
+        sweep(*first, *changed)
+    assert stop.value.code == 2
+    assert "other settings" in capsys.readouterr().err
+
+
+def test_a_mask_makes_another_sweep(field, reference):
+    grid = tdf.plane_grid(0.1, 3)
+    masked = dataclasses.replace(grid, mask=np.eye(3, dtype=bool))
+    digests = {command._digest(field, reference, one, np.eye(3)[None]) for one in (grid, masked, dataclasses.replace(masked, mask=~masked.mask))}
+    assert len(digests) == 3
+
+
+def test_what_fails_after_the_sweep_does_not_lose_it(sweep, tmp_path, monkeypatch):
+    def broken(*arguments):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(command, "lowest_cost_path", broken)
+        with pytest.raises(SystemExit):
+            sweep()
+    assert [path.name for path in tmp_path.iterdir()] == ["out.unfinished.npz"]
+    done = []
+    true_fill = command.fill
+    monkeypatch.setattr(command, "fill", lambda *arguments: (done.append(arguments[3]), true_fill(*arguments))[1])
+    sweep()
+    assert done == [1]
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_the_path_is_as_sharp_as_asked_and_left_out_of_large_grids(sweep, monkeypatch):
+    asked = []
+    true_path = command.lowest_cost_path
+    monkeypatch.setattr(command, "lowest_cost_path", lambda *arguments: (asked.append(arguments[3]), true_path(*arguments))[1])
+    sweep("--sharpness", 3)
+    assert asked == [3.0]
+    monkeypatch.setattr(command, "ROUTED", 24)
+    record, _ = sweep("--reduce", "mean")
+    assert record["path"] is None and record["path_metres"] is None
+    assert asked == [3.0]
+
+
+def test_missing_extras_are_told_before_any_work(weights, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(command, "fill", None)
+    for module, words in (("plotly.graph_objects", "plotly is not installed"), ("igl", "libigl")):
+        with monkeypatch.context() as patch:
+            patch.setitem(sys.modules, module, None)
+            with pytest.raises(SystemExit) as stop:
+                run("landscape", "--weights", weights, "--out", tmp_path / "out", "--grid", "volume", *QUICK)
+        assert stop.value.code == 2
+        assert words in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_long_sweep_is_kept_on_the_way(sweep, tmp_path, monkeypatch):
     """Nothing but the file helps against a power cut."""
     monkeypatch.setattr(lattice, "NODES", 60)
@@ -155,6 +223,8 @@ def test_a_demonstration_and_a_cloud_from_files(weights, tmp_path):
         (("--rotation", "turns", "--axis", "0", "0", "0"), "axis is"),
         (("--grid", "volume", "--pitch", "1e-6"), "GB free"),
         (("--grid", "path", "--pitch", "1e-6"), "GB free"),
+        (("--grid", "path", "--radius", "1e-5"), "expected a pitch of at most the radius"),
+        (("--pitch", "0.0001", "--half", "0.01"), "expected at most 4096"),
         (("--weights", "nothing"), "nothing"),
         (("--sharpness", "-1"), "--sharpness is -1"),
     ],

@@ -54,6 +54,23 @@ def test_a_turned_lattice_shares_where_the_grid_turns_with_it():
     assert len(lattice.layers(plane_grid(0.06, 11), query).offsets) == 18
 
 
+def test_points_nearly_on_the_lattice_do_not_share():
+    """A hundredth of a step is 0.1 mm: not the same place."""
+    query = np.asarray(tdf.lattice_query((2, 2, 1), 0.012), float)
+    query[0, 0] += 1e-4
+    assert len(lattice.layers(plane_grid(0.06, 11), query).offsets) == 2
+    query[0, 0] -= 1e-4 - 1e-8  # float32's rounding is
+    assert len(lattice.layers(plane_grid(0.06, 11), query).offsets) == 1
+
+
+def test_a_query_that_spans_far_more_than_a_tile_shares_nothing(monkeypatch):
+    monkeypatch.setattr(lattice, "NODES", 1000)
+    offsets = np.array([[0.0, 0, 0], [1.2, 1.2, 1.2]])
+    layers = lattice.layers(volume_grid(0.06, 11), offsets)
+    assert len(layers.offsets) == 2
+    assert layers.span == (0, 0, 0)
+
+
 def test_points_drawn_at_random_share_nothing():
     offsets = np.random.default_rng(0).normal(size=(20, 3))
     layers = lattice.layers(volume_grid(0.06, 11), offsets)

@@ -55,6 +55,17 @@ def test_the_cost_is_the_integral_over_length():
         assert path[2, 1] == pytest.approx(0.1 * row)
 
 
+def test_a_step_costs_the_mean_of_both_ends():
+    """The dear point is the goal's neighbour on one way, the goal's and its own steps cost half of it each."""
+    grid = Grid(np.zeros(3), np.eye(3)[:2], (np.linspace(0, 0.2, 3), np.linspace(0, 0.1, 2)))
+    energy = np.array([[1.0, 1.0], [2.4, 1.0], [1.0, 9.0]])  # straight: 2 x 1.7; by (0.1, 0.1), diagonal: 2 x 1.414
+    np.testing.assert_allclose(lowest_cost_path(of(grid, energy), (0, 0, 0), (0.2, 0, 0))[1], (0.1, 0.1, 0))
+    energy[1, 0] = 1.7  # straight: 2 x 1.35, though entering (0.1, 0) at its own price would cost 1.7 + 1
+    np.testing.assert_allclose(lowest_cost_path(of(grid, energy), (0, 0, 0), (0.2, 0, 0))[1], (0.1, 0, 0))
+    energy[1, 0], energy[0, 0] = 1.95, 0.5  # leaving counts too: (0.5 + 1.95) / 2 + (1.95 + 1) / 2 against 1.414 x (0.75 + 1)
+    np.testing.assert_allclose(lowest_cost_path(of(grid, energy), (0, 0, 0), (0.2, 0, 0))[1], (0.1, 0.1, 0))
+
+
 def test_paths_go_through_volumes_with_unequal_steps_and_only_where_points_count():
     grid = Grid(np.zeros(3), np.eye(3), (np.linspace(0, 0.3, 4), np.linspace(0, 0.2, 3), np.linspace(0, 0.5, 6)))
     path = lowest_cost_path(of(grid, np.ones(grid.shape)), (0, 0, 0), (0.3, 0, 0.5))
@@ -74,8 +85,9 @@ def test_what_cannot_be_joined_is_refused():
         lowest_cost_path(whole, (0, 0, 0), (1, 0, 0))
     with pytest.raises(InputError, match="start is"):
         lowest_cost_path(whole, (0, np.nan, 0), (0, 0, 0))
-    with pytest.raises(InputError, match="sharpness is -1"):
-        lowest_cost_path(whole, (0, 0, 0), (0, 0, 0.1), -1.0)
+    for sharpness in (-1.0, 51.0, np.nan):
+        with pytest.raises(InputError, match="sharpness is"):
+            lowest_cost_path(whole, (0, 0, 0), (0, 0, 0.1), sharpness)
     energy = np.ones(grid.shape)
     energy[1] = np.nan
     with pytest.raises(InputError, match="do not join"):

@@ -162,6 +162,10 @@ def test_the_change_of_a_query_set_is_told(small_model, demonstration, field, re
         changes.append(query_change(field, reference, tdf.describe(small_model, snapped), grid, RANDOM[0]))
     assert 0 < changes[0][0] < changes[0][1] < changes[1][1]
     assert changes[0][0] < 0.3 * changes[1][0]
+    whole = [energy_landscape(field, one, grid, RANDOM[0]).values for one in (reference, tdf.describe(small_model, snapped))]
+    true = np.abs(whole[1] / whole[0] - 1)
+    told = query_change(field, reference, tdf.describe(small_model, snapped), grid, RANDOM[0], samples=2000)
+    np.testing.assert_allclose(told, (np.median(true), true.max()), rtol=0.05)
 
 
 def test_devices_share_the_tiles(tmp_path):
@@ -203,8 +207,11 @@ def test_what_does_not_fit_is_refused(field, reference):
     grid = plane_grid(0.2, 3)
     with pytest.raises(InputError, match=r"rotation has shape \(7,\)"):
         energy_landscape(field, reference, grid, jnp.zeros(7))
-    with pytest.raises(InputError, match="no rotations"):
-        energy_landscape(field, reference, grid, 2 * np.eye(3))
+    for matrix in (2 * np.eye(3), np.diag([1.0, 1.0, -1.0])):
+        with pytest.raises(InputError, match="no rotations"):
+            energy_landscape(field, reference, grid, matrix)
+    with pytest.raises(InputError, match="devices is empty"):
+        energy_landscape(field, reference, grid, devices=[])
     with pytest.raises(InputError, match="over_rotations is 'all'"):
         energy_landscape(field, reference, grid, over_rotations="all")
     with pytest.raises(InputError, match="reduce is 'min'"):

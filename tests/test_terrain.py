@@ -98,7 +98,19 @@ def test_a_page_needs_no_network(tmp_path, marks, axes, masked):
     page = (tmp_path / "it.html").read_text()
     assert "<script src=" not in page and 'src="http' not in page
     assert "A title" in page and "lowest-cost path" in page
-    assert ('"volume"' if axes == 3 else '"surface"') in page
+    assert ("least 2 %" in page) == (axes == 3)
+    assert ('"name":"energy"' in page) == (axes == 2)
+    with pytest.raises(InputError, match="cannot write"):
+        terrain.save_page(tmp_path / "no folder" / "it.html", landscape, one)
+
+
+def test_a_map_of_many_waypoints_shows_some():
+    landscape = bowl(plane_grid(0.2, 4))
+    many = {"values": np.repeat(landscape.values, 50, axis=0), "turned": np.repeat(landscape.turned, 50, axis=0)}
+    figure = terrain.map_figure(dataclasses.replace(landscape, **many, waypoints=np.repeat(WAYPOINTS, 50, axis=0)), terrain.Marks(POINTS))
+    titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
+    assert len(titles) == 1 + terrain.PANELS
+    assert titles[1] == "waypoint 0" and titles[-1] == "waypoint 99"
 
 
 def test_what_cannot_be_shown_is_refused(tmp_path, marks, monkeypatch):

@@ -26,6 +26,7 @@ from tdf_jax.field import DescriptorField
 from tdf_jax.files import replace_file, replace_folder
 from tdf_jax.grid import PLANES, Grid, distance_from_polyline, path_grid, plane_grid, volume_grid
 from tdf_jax.landscape import Landscape, load_landscape, save_landscape
+from tdf_jax.meshes import libigl
 from tdf_jax.model import encode
 from tdf_jax.optimize import default_goal
 from tdf_jax.query import lattice_query, snapped_query
@@ -38,6 +39,8 @@ SCHEMA = 1  # raised when a field of result.json changes its meaning or goes
 STREAM = 0x1A2D5CA9  # folded into the seed's key
 SAVE_SECONDS = 20.0  # between saves of an unfinished sweep
 NUMBER = 4  # bytes
+LATTICE = 4096  # query points at most; 57 kB each with seven waypoints
+ROUTED = 1_000_000  # points of a grid at most for the lowest-cost path, which takes 1 kB each
 
 
 def landscape(settings: Annotated[LandscapeSettings, tyro.conf.arg(name="")] = LandscapeSettings()) -> None:
@@ -56,17 +59,22 @@ def landscape(settings: Annotated[LandscapeSettings, tyro.conf.arg(name="")] = L
     rotations = _rotations(settings, np.asarray(given.trajectory.rotations[0], dtype=float))
     axes = rotations[0].T if settings.rotation in ("pick", "identity") else np.eye(3)
     _check_size(settings, waypoints, given.trajectory.poses)
+    _check_extras(settings)
     grid = _grid(settings, waypoints, axes)
     query = _query(settings, np.asarray(scene.demonstration.query))
     demonstration = dataclasses.replace(scene.demonstration, query=query)
     reference = given if settings.query == "given" else describe(model, demonstration)
     with replace_folder("tdf landscape", settings.out, RESULT, NAMES) as folder:
+        swept = time.perf_counter()
         found = _swept(settings, field, reference, grid, rotations)
-        seconds = {"sweep": time.perf_counter() - began}
+        seconds = {"sweep": time.perf_counter() - swept}
         goal = default_goal(field, given)
         expected = scene.expected(goal)
         expected = None if expected is None else np.asarray(expected.translations, dtype=float)
-        path = lowest_cost_path(found, *_ends(grid, waypoints[0] if expected is None else expected[0], np.asarray(goal[4:])), settings.sharpness)
+        path = None
+        if math.prod(grid.shape) <= ROUTED:
+            ends = _ends(grid, waypoints[0] if expected is None else expected[0], np.asarray(goal[4:]))
+            path = lowest_cost_path(found, *ends, settings.sharpness)
         change = None if settings.query == "given" else query_change(field, given, reference, grid, rotations[0])
         if not settings.no_plots:
             _draw(settings, folder, scene, found, expected, path)
@@ -89,7 +97,7 @@ def _rotations(settings, at_pick):
 
 def _grid(settings, waypoints, axes) -> Grid:
     if settings.grid == "path":
-        return path_grid(waypoints, settings.radius, min(settings.pitch, settings.radius))
+        return path_grid(waypoints, settings.radius, settings.pitch, axes)
     count = round(2 * settings.half / settings.pitch) + 1
     half = settings.pitch * (count - 1) / 2
     middle = (waypoints.min(axis=0) + waypoints.max(axis=0)) / 2
@@ -112,15 +120,32 @@ def _check_size(settings, waypoints, count) -> None:
         )
 
 
+def _check_extras(settings) -> None:
+    """Refuse at once what could not be drawn at the end."""
+    if settings.no_plots:
+        return
+    if settings.grid not in PLANES:
+        libigl("tdf landscape")
+    if not settings.no_page:
+        from tdf_jax.viz.terrain import pages
+
+        pages("tdf landscape")
+
+
 def _query(settings, query):
     """The query points of the sweep: nodes of the grid's lattice, if wanted."""
     if settings.query == "given":
         return query
     low, high = query.min(axis=0), query.max(axis=0)
     shape = [max(1, round(float(side) / settings.pitch) + 1) for side in high - low]
-    # The lattice lies along the query frame's axes, and so do the grid's where there is one orientation.
     if settings.query == "snapped":
         return np.asarray(snapped_query(query, settings.pitch, (low + high) / 2))
+    if math.prod(shape) > LATTICE:
+        raise InputError(
+            f"tdf landscape: a lattice of --pitch {settings.pitch} in the query points' box has {math.prod(shape)} points; expected at most "
+            f"{LATTICE}: raise --pitch, or use --query snapped"
+        )
+    # Along the query frame's axes, as the grid's are where there is one orientation.
     return np.asarray(lattice_query(shape, settings.pitch, (low + high) / 2))
 
 
@@ -145,9 +170,8 @@ def _swept(settings, field: DescriptorField, reference: Reference, grid: Grid, r
                 if time.monotonic() - saved > SAVE_SECONDS and done < total:
                     save_landscape(file, found, {"digest": digest, "done": done})
                     saved = time.monotonic()
-        except KeyboardInterrupt:
+        finally:  # also when all is done: what comes next may fail or be interrupted
             save_landscape(file, found, {"digest": digest, "done": done})
-            raise
     return found
 
 
@@ -158,7 +182,12 @@ def _unfinished(settings) -> Path:
 def _digest(field, reference, grid, rotations) -> str:
     """What the energies are a function of."""
     leaves = [*jax.tree.leaves((field, reference)), grid.origin, grid.directions, *grid.coordinates, rotations]
-    return hashlib.sha256(b"".join(np.ascontiguousarray(leaf).tobytes() for leaf in leaves)).hexdigest()[:16]
+    leaves += [] if grid.mask is None else [grid.mask]
+    # Parts are counted by tiles, so these too.
+    query = np.asarray(reference.query, dtype=float)
+    tiles = [lattice.tiles(grid, lattice.layers(grid, query @ R.T).span) for R in rotations]
+    content = b"".join(np.ascontiguousarray(leaf).tobytes() for leaf in leaves) + repr(tiles).encode()
+    return hashlib.sha256(content).hexdigest()[:16]
 
 
 def _ends(grid, start, goal):
@@ -186,6 +215,7 @@ def _record(settings, found: Landscape, reference, change, waypoints, expected, 
     query = np.asarray(reference.query, dtype=float)
     layers = [lattice.layers(found.grid, query @ R.T) for R in found.rotations]
     truth = waypoints if expected is None else expected
+    points = math.prod(found.grid.shape) if found.grid.mask is None else int(found.grid.mask.sum())
     return {
         "schema": SCHEMA,
         "settings": {name: str(value) if isinstance(value, Path) else value for name, value in dataclasses.asdict(settings).items()},
@@ -193,14 +223,14 @@ def _record(settings, found: Landscape, reference, change, waypoints, expected, 
         "queries": len(query),
         "rotations": len(found.rotations),
         "evaluations": sum(lattice.evaluations(found.grid, each) for each in layers),
-        "one_by_one": math.prod(found.grid.shape) * len(query) * len(found.rotations),
+        "one_by_one": points * len(query) * len(found.rotations),
         "query_change": None if change is None else {"median": change[0], "largest": change[1]},
         "energy": {"least": float(np.nanmin(found.combined)), "median": float(np.nanmedian(found.combined))},
         "minimisers": found.minimisers.tolist(),
         "truth": None if expected is None else expected.tolist(),
         "minimiser_metres": np.linalg.norm(found.minimisers - truth, axis=1).tolist(),
-        "path": path.tolist(),
-        "path_metres": float(distance_from_polyline(path, truth).mean()),
+        "path": None if path is None else path.tolist(),
+        "path_metres": None if path is None else float(distance_from_polyline(path, truth).mean()),
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
     }
 
@@ -208,14 +238,14 @@ def _record(settings, found: Landscape, reference, change, waypoints, expected, 
 def _table(record: dict, out: Path) -> str:
     """The record in a few lines."""
     against = "the true waypoints" if record["truth"] is not None else "the demonstration's, moved with the centroid"
-    change = record["query_change"]
+    change, route = record["query_change"], record["path_metres"]
     rows = {
         "grid": " x ".join(map(str, record["grid"]["shape"])) + f" points, {record['queries']} queries, {record['rotations']} orientations",
         "evaluations": f"{record['evaluations']:,} of the field; one by one {record['one_by_one']:,}",
         "lattice": "none" if change is None else f"changes the energy by {change['median']:.1%} (median), {change['largest']:.1%} (most)",
         "energy": f"least {record['energy']['least']:.5f}, median {record['energy']['median']:.5f}",
         "minimisers": ", ".join(f"{100 * metres:.1f}" for metres in record["minimiser_metres"]) + f" cm from {against}",
-        "lowest-cost path": f"{100 * record['path_metres']:.1f} cm from the polyline through them, mean",
+        "lowest-cost path": "not sought, the grid is too large" if route is None else f"{100 * route:.1f} cm from the polyline through them, mean",
         "time": f"{record['seconds']['total']:.1f} s, sweep {record['seconds']['sweep']:.1f}",
         "written to": str(out),
     }

@@ -8,6 +8,7 @@ import numpy as np
 import tyro
 
 from tdf_jax.errors import InputError
+from tdf_jax.route import SHARPEST
 
 SEEDS = 2**32  # jax cuts a larger one to 32 bits without a word
 
@@ -79,12 +80,13 @@ class LandscapeSettings(SceneSettings):
 
     Attributes:
         target_pose: as its file says, or moved by a random rotation and translation.
-        grid: a plane of the orientation's axes through the demonstration's path, a volume about it, or the path's neighbourhood.
+        grid: a plane through the middle of the demonstration's path, a volume about it, or the path's neighbourhood; along the axes of the
+            orientation, or of the world where there are many.
         half: of the plane's or volume's side, metres.
         radius: of the neighbourhood of a path, metres.
         pitch: distance of neighbouring points, metres; the side is rounded to whole ones.
         query: a lattice of the grid's pitch in the box of the demonstration's query points, or those points moved onto it, or as they
-            are: exact, and some thirty times slower.
+            are: some thirty times slower in one orientation; with many, a lattice would save nothing.
         rotation: of the query frame: the demonstration's at the pick, the world's axes (as in the paper), the best of many at every
             point, or the pick's turned about an axis, the best at every point.
         rotations: number of them for "best" and "turns".
@@ -102,7 +104,7 @@ class LandscapeSettings(SceneSettings):
     half: float = 0.3
     radius: float = 0.1
     pitch: float = 0.012
-    query: Literal["lattice", "snapped", "given"] = "lattice"
+    query: Annotated[Literal["lattice", "snapped", "given"] | None, _option(default="lattice; given for many orientations")] = None
     rotation: Literal["pick", "identity", "best", "turns"] = "pick"
     rotations: int = 24
     axis: Annotated[tuple[float, float, float], _option("X Y Z")] = (0.0, 0.0, 1.0)
@@ -123,7 +125,11 @@ def resolved(settings: SceneSettings) -> SceneSettings:
         InputError: a bad number, or options that contradict each other.
     """
     _check_numbers(settings)
-    generated = "given" if isinstance(settings, LandscapeSettings) else "random"
+    generated = "random"
+    if isinstance(settings, LandscapeSettings):
+        generated = "given"
+        one = settings.rotation in ("pick", "identity")
+        settings = dataclasses.replace(settings, query=settings.query or ("lattice" if one else "given"))
     pose = settings.target_pose or (generated if settings.target is None else "given")
     if settings.demonstration is None:
         return dataclasses.replace(
@@ -155,7 +161,9 @@ def _check_numbers(settings: SceneSettings) -> None:
                 raise InputError(f"tdf landscape: --{name} is {getattr(settings, name)}; expected a length above 0, metres")
         if settings.grid != "path" and settings.half < settings.pitch / 2:
             raise InputError(f"tdf landscape: --half is {settings.half}; expected at least half the pitch of {settings.pitch}: two points a side")
-        if not 0 <= settings.sharpness < np.inf:
-            raise InputError(f"tdf landscape: --sharpness is {settings.sharpness}; expected a number of 0 or more")
+        if not 0 <= settings.sharpness <= SHARPEST:
+            raise InputError(f"tdf landscape: --sharpness is {settings.sharpness}; expected 0 to {SHARPEST:g}")
+        if settings.grid == "path" and settings.pitch > settings.radius:
+            raise InputError(f"tdf landscape: --pitch is {settings.pitch} and --radius {settings.radius}; expected a pitch of at most the radius")
         if settings.rotations < 1:
             raise InputError(f"tdf landscape: --rotations is {settings.rotations}; expected at least 1")

@@ -27,7 +27,9 @@ PANEL = 1.75  # inches
 CONTOURS = 12
 NEAR = 1.5  # steps off the plane within which an object's points are drawn on a map
 LEVELS = (0.02, 0.10)  # shares of a volume that lie within its surfaces of equal energy
+SURFACES = COLOURS(0.15), COLOURS(0.75)
 SEE_THROUGH = 0.30
+PANELS = 24  # of waypoints on a map; of more, so many evenly spread
 FRAMES_A_SECOND = 8
 GIF_DPI = 100
 SHOWN = 1500  # points of an object's cloud
@@ -63,7 +65,8 @@ def map_figure(landscape: Landscape, marks: Marks, title: str = "") -> Figure:
         InputError: the grid has one or three axes, or each rotation was kept.
     """
     _check("map_figure", landscape, axes=2)
-    panels = {"all waypoints": landscape.combined} | {f"waypoint {index}": part for index, part in enumerate(landscape.values)}
+    shown = np.unique(np.linspace(0, len(landscape.values) - 1, PANELS).round().astype(int))
+    panels = {"all waypoints": landscape.combined} | {f"waypoint {index}": landscape.values[index] for index in shown}
     columns = min(COLUMNS, len(panels))
     rows = -(-len(panels) // columns)
     first, second = (CENTIMETRES * steps for steps in landscape.grid.coordinates)
@@ -76,7 +79,7 @@ def map_figure(landscape: Landscape, marks: Marks, title: str = "") -> Figure:
             axes.remove()
         for index, (axes, (name, energy)) in enumerate(zip(grid.flat, panels.items())):
             picture = _map(axes, first, second, energy, low, high)
-            chosen = slice(None) if index == 0 else slice(index - 1, index)
+            chosen = slice(None) if index == 0 else shown[index - 1 : index]
             _mark(axes, landscape, marks, chosen, whole=index == 0)
             axes.set_title(name)
         names = [_axis_name(direction) for direction in landscape.grid.directions]
@@ -85,7 +88,7 @@ def map_figure(landscape: Landscape, marks: Marks, title: str = "") -> Figure:
                 grid.flat[index].set_xlabel(f"{names[0]} from the middle (cm)")
             if index % columns == 0:
                 grid.flat[index].set_ylabel(f"{names[1]} from the middle (cm)")
-        figure.colorbar(picture, ax=grid, label="energy (no unit)", shrink=0.8, pad=0.01)
+        figure.colorbar(picture, ax=list(grid.flat[: len(panels)]), label="energy (no unit)", shrink=0.8, pad=0.01)
         legend = legend_of(grid[0, 0])
         figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=4, facecolor=COLOURS(0.45), labelcolor="white")
         figure.suptitle(title)
@@ -112,7 +115,7 @@ def isosurface_figure(landscape: Landscape, marks: Marks, title: str = "") -> Fi
             pieces += solid.surface(CENTIMETRES * np.asarray(marks.mesh.triangles), LIGHT)
         else:
             axes.scatter(*(CENTIMETRES * marks.points[:: max(1, len(marks.points) // SHOWN)].T), s=1.5, color=CLOUD, linewidths=0)
-        for share, colour in zip(LEVELS, (COLOURS(0.15), COLOURS(0.75))):
+        for share, colour in zip(LEVELS, SURFACES):
             triangles = CENTIMETRES * isosurface(landscape, share)
             count = len(triangles)
             pieces += solid.Pieces(list(triangles), [(*colour[:3], SEE_THROUGH)] * count, [(*colour[:3], 0.0)] * count)
@@ -207,12 +210,10 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
         title: of the page.
 
     Raises:
-        InputError: the grid has one axis, each rotation was kept, plotly is not installed, or the file cannot be written.
+        InputError: the grid has one axis, each rotation was kept, plotly (or, for a volume, libigl) is not installed, or the file cannot
+            be written.
     """
-    try:
-        import plotly.graph_objects as plotly
-    except ImportError:
-        raise InputError("save_page(): plotly is not installed; expected it for pages: pip install 'tdf_jax[pages]'") from None
+    plotly = pages("save_page()")
     grid = landscape.grid
     _check("save_page", landscape, axes=len(grid.shape) if len(grid.shape) > 1 else 2)
     energy, points = landscape.combined, CENTIMETRES * grid.points
@@ -221,11 +222,14 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
         x, y, z = np.moveaxis(points, -1, 0)
         drawn = [plotly.Surface(x=x, y=y, z=z, surfacecolor=energy, name="energy", **scale)]
     else:
-        inside = np.isfinite(energy)
-        x, y, z = points.reshape(-1, 3).T
-        value = np.where(inside, energy, np.nanmax(energy)).ravel()
-        levels = {"isomin": float(np.nanmin(energy)), "isomax": float(np.nanquantile(energy, LEVELS[-1]))}
-        drawn = [plotly.Volume(x=x, y=y, z=z, value=value, opacity=0.25, surface={"count": 4}, **levels, **scale)]
+        drawn = []
+        # Surfaces of our own: plotly's know only grids along its axes.
+        for share, colour in zip(LEVELS, SURFACES):
+            x, y, z = CENTIMETRES * isosurface(landscape, share).reshape(-1, 3).T
+            i, j, k = np.arange(len(x)).reshape(-1, 3).T
+            name = f"energy {np.nanquantile(energy, share):.4f}: least {100 * share:.0f} %"
+            look = {"color": matplotlib.colors.to_hex(colour), "opacity": SEE_THROUGH, "name": name, "showlegend": True}
+            drawn.append(plotly.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, **look))
     if marks.mesh is not None:
         x, y, z = CENTIMETRES * np.asarray(marks.mesh.vertices).T
         i, j, k = np.asarray(marks.mesh.faces).T
@@ -240,10 +244,26 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
         drawn.append(plotly.Scatter3d(x=x, y=y, z=z, mode=mode, name=style["label"], **look))
     figure = plotly.Figure(drawn)
     ends = {f"{axis}axis": {"title": f"{axis} (cm)"} for axis in "xyz"}
-    figure.update_layout(title=title, scene=ends | {"aspectmode": "data"}, legend={"x": 0, "y": 1})
+    azimuth, height = np.radians(ANGLES["azim"]), np.radians(ANGLES["elev"])
+    eye = 1.8 * np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
+    scene = ends | {"aspectmode": "data", "camera": {"eye": dict(zip("xyz", eye.tolist()))}}
+    figure.update_layout(title=title, scene=scene, legend={"x": 0, "y": 1}, margin={"l": 0, "r": 0, "b": 0, "t": 40})
     page = io.StringIO()
-    figure.write_html(page, include_plotlyjs=True, full_html=True)
+    figure.write_html(page, include_plotlyjs=True, full_html=True, default_height="95vh")
     replace_file("save_page", Path(path), page.getvalue().encode())
+
+
+def pages(function: str):
+    """The plotly module that draws pages.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        import plotly.graph_objects
+    except ImportError:
+        raise InputError(f"{function}: plotly is not installed; expected it for pages: pip install 'tdf_jax[pages]'") from None
+    return plotly.graph_objects
 
 
 def _check(function, landscape, axes):
