@@ -245,7 +245,7 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
     figure = plotly.Figure(drawn)
     ends = {f"{axis}axis": {"title": f"{axis} (cm)"} for axis in "xyz"}
     azimuth, height = np.radians(ANGLES["azim"]), np.radians(ANGLES["elev"])
-    eye = 1.8 * np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
+    eye = 2.2 * np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
     scene = ends | {"aspectmode": "data", "camera": {"eye": dict(zip("xyz", eye.tolist()))}}
     figure.update_layout(title=title, scene=scene, legend={"x": 0, "y": 1}, margin={"l": 0, "r": 0, "b": 0, "t": 40})
     page = io.StringIO()
