@@ -14,6 +14,7 @@ import pytest
 import tdf_jax as tdf
 from tdf_jax.cli import main as command_line, report, scene
 from tdf_jax.cli.main import main
+from tdf_jax.cli.settings import Settings
 from tdf_jax.evaluation.truth import pose_error
 from tdf_jax.recording import save_demonstration
 from tdf_jax.shapes import build_mug
@@ -231,7 +232,7 @@ def test_an_own_target_has_no_truth(imitate, tmp_path, capsys, kind):
 
 def test_scale_and_pose_of_an_own_target(tmp_path):
     np.save(tmp_path / "cloud.npy", cloud := np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32))
-    settings = scene.Settings(target=tmp_path / "cloud.npy", scale=0.1, target_pose="random", poses=3, queries=4)
+    settings = Settings(target=tmp_path / "cloud.npy", scale=0.1, target_pose="random", poses=3, queries=4)
     made = scene.make_scene(dataclasses.replace(settings, trajectory="line"), jax.random.key(0))
     T = made.T_world_target
     np.testing.assert_allclose(made.points, 0.1 * cloud @ T[:3, :3].T + T[:3, 3], atol=1e-6)
@@ -241,7 +242,7 @@ def test_scale_and_pose_of_an_own_target(tmp_path):
 
 def test_a_drawn_mesh_lies_where_its_points_do(tmp_path):
     path = mesh_file(tmp_path, "stl")
-    settings = scene.Settings(target=path, target_pose="random", trajectory="line", poses=2, queries=4)
+    settings = Settings(target=path, target_pose="random", trajectory="line", poses=2, queries=4)
     for one in (settings, dataclasses.replace(settings, target=None)):
         made = scene.make_scene(one, jax.random.key(0))
         for points, mesh in zip((made.demonstration.points, made.points), made.meshes):
@@ -250,7 +251,7 @@ def test_a_drawn_mesh_lies_where_its_points_do(tmp_path):
 
 @pytest.mark.parametrize("shape", ["line", "semicircle", "wave"])
 def test_generated_demonstrations_go_from_the_handle_to_the_place(shape):
-    settings = scene.Settings(trajectory=shape, poses=5, queries=7, target_pose="given")
+    settings = Settings(trajectory=shape, poses=5, queries=7, target_pose="given")
     made = scene.make_scene(settings, jax.random.key(0))
     shown, (handle_a, handle_b) = made.demonstration, made.T_world_handles
     ends = shown.trajectory.matrices
@@ -605,6 +606,6 @@ def test_every_start_non_finite_is_told(refusal, weights, monkeypatch):
 
 
 def test_commands_are_the_functions_of_their_modules():
-    assert set(command_line.COMMANDS) == {"imitate", "convert", "evaluate", "dataset", "train", "reproduce"}
+    assert set(command_line.COMMANDS) == {"imitate", "landscape", "convert", "evaluate", "dataset", "train", "reproduce"}
     for name in command_line.COMMANDS:
         assert callable(getattr(sys.modules[f"tdf_jax.cli.{name}"], name))

@@ -173,11 +173,22 @@ def test_metrics_cut_short_anywhere_are_dropped(tmp_path):
 def test_a_run_may_go_on_from_weights(train, whole, tmp_path):
     """It starts where the weights left off, with its frame read out again, not from the beginning."""
     before = jax.tree.map(np.array, whole[1])
-    train(dataclasses.replace(CONFIG, steps=4), tmp_path, initial=whole[1])
+    train(dataclasses.replace(CONFIG, steps=4, corruption=0.0), tmp_path, initial=whole[1])
     assert_same(whole[1], before)  # still there, and as they were
     first, fresh = metrics(tmp_path)[0], metrics(whole[0])[0]  # of the same objects
     assert first["bce"] < 0.97 * fresh["bce"]
     assert first["frame"] < 0.7 * fresh["frame"]
+
+
+def test_clouds_are_as_sensors_give_them_from_the_first_step_of_a_run_that_goes_on(train, whole, tmp_path, monkeypatch):
+    asked, drawn = [], loop.draw
+    monkeypatch.setattr(loop, "draw", lambda *arguments: (asked.append(arguments[5]), drawn(*arguments))[1])
+    short = dataclasses.replace(CONFIG, steps=4, corruption=0.5)
+    train(short, tmp_path / "on", initial=whole[1])
+    assert asked[1:] == [0.5] * 5  # the first draw reads the frame out; one batch more than steps is drawn ahead
+    asked.clear()
+    train(short, tmp_path / "fresh")
+    assert asked[1] == 0.0 and asked[4] == 0.5
 
 
 def test_minutes_become_steps(sets, monkeypatch):
