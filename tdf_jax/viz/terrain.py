@@ -220,7 +220,7 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
     scale = {"colorscale": "Viridis", "colorbar": {"title": "energy"}}
     if energy.ndim == 2:
         x, y, z = np.moveaxis(points, -1, 0)
-        drawn = [plotly.Surface(x=x, y=y, z=z, surfacecolor=energy, name="energy", **scale)]
+        drawn = [plotly.Surface(x=x, y=y, z=z, surfacecolor=energy, opacity=0.85, name="energy", **scale)]
     else:
         drawn = []
         # Surfaces of our own: plotly's know only grids along its axes.
@@ -245,7 +245,7 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
     figure = plotly.Figure(drawn)
     ends = {f"{axis}axis": {"title": f"{axis} (cm)"} for axis in "xyz"}
     azimuth, height = np.radians(ANGLES["azim"]), np.radians(ANGLES["elev"])
-    eye = 2.2 * np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
+    eye = 2.6 * np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
     scene = ends | {"aspectmode": "data", "camera": {"eye": dict(zip("xyz", eye.tolist()))}}
     figure.update_layout(title=title, scene=scene, legend={"x": 0, "y": 1}, margin={"l": 0, "r": 0, "b": 0, "t": 40})
     page = io.StringIO()
