@@ -19,7 +19,8 @@ def lowest_cost_path(
     """The path from start to goal along which the integral of energy^sharpness over length is least.
 
     Dijkstra's algorithm (scipy) over the points that count, each joined to all its neighbours, diagonal ones included; a step costs its
-    length times the mean of both ends' energy^sharpness. About 1 kB of memory a point. A step of the grid is the resolution, and directions are multiples of 45 degrees.
+    length times the mean of both ends' energy^sharpness. Memory grows with the points: by estimate 1 kB each.
+    A step of the grid is the resolution, and directions are multiples of 45 degrees.
 
     Args:
         landscape: in one orientation, or the best of several.

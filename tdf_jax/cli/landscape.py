@@ -40,7 +40,7 @@ STREAM = 0x1A2D5CA9  # folded into the seed's key
 SAVE_SECONDS = 20.0  # between saves of an unfinished sweep
 NUMBER = 4  # bytes
 LATTICE = 4096  # query points at most; 57 kB each with seven waypoints
-ROUTED = 1_000_000  # points of a grid at most for the lowest-cost path, which takes 1 kB each
+ROUTED = 1_000_000  # points of a grid at most for the lowest-cost path, by estimate 1 kB each
 
 
 def landscape(settings: Annotated[LandscapeSettings, tyro.conf.arg(name="")] = LandscapeSettings()) -> None:
