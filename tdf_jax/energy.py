@@ -153,14 +153,32 @@ def compensator_loss(trajectory: Trajectory, order: str = "frobenius") -> Float[
     return _compensator(trajectory.rotations, trajectory.translations, order)
 
 
-def _correlation(R, t, origin, reference, lever, pose_norm):
-    target = reference.trajectory
-    shift = t - origin - target.translations
+def pose_difference(
+    R: Float[Array, "*batch 3 3"],
+    t: Float[Array, "*batch 3"],
+    origin: Float[Array, "3"],
+    target: Float[Array, "*batch 7"],
+    lever: Float[Array, ""] | float,
+    pose_norm: str,
+) -> Float[Array, "*batch numbers"]:
+    """What eq. 3 takes the norm of: how poses differ from the demonstration's, relative to each cloud's centroid; 12 numbers, or 4 of "metres_radians".
+
+    Args:
+        R, t: poses of the query frame in the world.
+        origin: centroid of the new object's cloud, metres, world frame.
+        target: the demonstration's, relative to its centroid, `wxyz_xyz`.
+        lever, pose_norm: see `EnergyWeights`.
+    """
+    shift = t - origin - poses.translation(target)
     if pose_norm == "metres_radians":
-        turn = poses.rotation_distance(R, target.rotations)[:, None]
+        turn = poses.rotation_distance(R, poses.rotation(target))[..., None]
     else:
-        turn = (R - target.rotations).reshape(-1, 9)
-    difference = jnp.concatenate([shift, lever * turn], axis=-1)
+        turn = (R - poses.rotation(target)).reshape(*R.shape[:-2], 9)
+    return jnp.concatenate([shift, lever * turn], axis=-1)
+
+
+def _correlation(R, t, origin, reference, lever, pose_norm):
+    difference = pose_difference(R, t, origin, reference.trajectory.wxyz_xyz, lever, pose_norm)
     return jnp.mean(_norm(difference[..., None] if pose_norm == "mean_absolute" else difference))
 
 

@@ -160,30 +160,9 @@ def optimize(
     Raises:
         InputError: starts, goal or weights of a wrong shape or value, or a reference from another network than the field.
     """
-    channels = field.conditioned.config.channels
-    if reference.descriptors.shape[-1] != channels:
-        raise InputError(
-            f"optimize(): the reference has {reference.descriptors.shape[-1]} channels and the field {channels}; "
-            "expected both from the same model"
-        )
-    if starts is None:
-        check_key("optimize()", key)
-        goal = default_goal(field, reference) if goal is None else goal
-        starts = random_starts(key, field, reference, config.inits, config.start, config.start_radius)
-    if goal is not None:
-        _check_goal(goal)
-    starts = jnp.asarray(starts)
-    if starts.ndim != 3 or starts.shape[1:] != (reference.trajectory.poses, 7):
-        raise InputError(
-            f"optimize(): starts have shape {starts.shape}; expected (inits, {reference.trajectory.poses}, 7), "
-            "as many poses as the demonstration has"
-        )
-    # One type of every traced number: mixed ones promote, and a weight of 0 for 0.02 would compile again.
-    dtype = jnp.result_type(starts, reference.query, reference.descriptors, field.latent)
-    _check_weights(energy)
-    energy = jax.tree.map(lambda weight: jnp.asarray(weight, dtype), energy)
-    starts, state = _begin(starts.astype(dtype), None if goal is None else jnp.asarray(goal, dtype), reference.query)
-    check_trajectory(Trajectory(np.reshape(starts, (-1, 7))), "starts")
+    starts, energy = prepare("optimize()", field, reference, key, goal, energy, config, starts)
+    dtype = starts.dtype
+    state = _begin(starts, reference.query)
     count = config.chunk or max(1, CHUNK_POINTS // len(reference.query))
     program = functools.partial(_run, fix_last=fix_last, chunk=count)
     rates = jnp.asarray([config.rotation_rate, config.translation_rate, config.final_rate, config.iterations], dtype)
@@ -200,24 +179,71 @@ def optimize(
     return Result(trajectories, jnp.concatenate(losses, axis=1), block[:, 0], starts)
 
 
+def prepare(
+    function: str,
+    field: DescriptorField,
+    reference: Reference,
+    key: PRNGKeyArray,
+    goal: Float[Array, "7"] | None,
+    energy: EnergyWeights,
+    config,
+    starts: Float[Array, "inits poses 7"] | None,
+) -> tuple[Float[Array, "inits poses 7"], EnergyWeights]:
+    """Checked starts that end at the goal, and weights of the same type; see `optimize`.
+
+    Args:
+        function: name for messages.
+        config: with `inits`, `start` and `start_radius`.
+
+    Raises:
+        InputError: starts, goal or weights of a wrong shape or value, or a reference from another network than the field.
+    """
+    channels = field.conditioned.config.channels
+    if reference.descriptors.shape[-1] != channels:
+        raise InputError(
+            f"{function}: the reference has {reference.descriptors.shape[-1]} channels and the field {channels}; "
+            "expected both from the same model"
+        )
+    if starts is None:
+        check_key(function, key)
+        goal = default_goal(field, reference) if goal is None else goal
+        starts = random_starts(key, field, reference, config.inits, config.start, config.start_radius)
+    if goal is not None:
+        _check_goal(function, goal)
+    starts = jnp.asarray(starts)
+    if starts.ndim != 3 or starts.shape[1:] != (reference.trajectory.poses, 7):
+        raise InputError(
+            f"{function}: starts have shape {starts.shape}; expected (inits, {reference.trajectory.poses}, 7), "
+            "as many poses as the demonstration has"
+        )
+    # One type of every traced number: mixed ones promote, and a weight of 0 for 0.02 would compile again.
+    dtype = jnp.result_type(starts, reference.query, reference.descriptors, field.latent)
+    _check_weights(function, energy)
+    energy = jax.tree.map(lambda weight: jnp.asarray(weight, dtype), energy)
+    starts = starts.astype(dtype)
+    starts = starts if goal is None else starts.at[:, -1].set(jnp.asarray(goal, dtype))
+    check_trajectory(Trajectory(np.reshape(starts, (-1, 7))), "starts")
+    return starts, energy
+
+
 def default_goal(field: DescriptorField, reference: Reference) -> Float[Array, "7"]:
     """The demonstration's last pose, carried by the centroids."""
     return reference.trajectory.shifted(field.origin).wxyz_xyz[-1]
 
 
-def _check_weights(energy):
+def _check_weights(function, energy):
     # Here, not where they are made: a gradient with respect to the weights is an EnergyWeights too, and may be negative.
     for name in ("correlation", "compensator", "lever"):
         value = getattr(energy, name)
         if not isinstance(value, jax.core.Tracer) and not (np.ndim(value) == 0 and 0 <= float(value) < np.inf):
-            raise InputError(f"optimize(): energy.{name} is {value}; expected one finite number of 0 or more")
+            raise InputError(f"{function}: energy.{name} is {value}; expected one finite number of 0 or more")
 
 
-def _check_goal(goal):
+def _check_goal(function, goal):
     values = np.asarray(goal)
     if values.shape != (7,) or not np.isfinite(values).all() or not values[:4].any():
         raise InputError(
-            f"optimize(): goal of shape {values.shape} is {values}; expected one finite pose wxyz_xyz, (7,), "
+            f"{function}: goal of shape {values.shape} is {values}; expected one finite pose wxyz_xyz, (7,), "
             "its quaternion not zero"
         )
 
@@ -250,15 +276,11 @@ def _start(key, origin, reference, start, radius):
 
 
 @jax.jit
-def _begin(starts, goal, query):
-    """Starts that end at the goal, if there is one, and the optimiser's state.
-
-    The state is: the variables (rotation vectors away from the starts, places of the query centroid), Adam's moments, steps done.
-    """
-    starts = starts if goal is None else starts.at[:, -1].set(goal)
+def _begin(starts, query):
+    """The optimiser's state: the variables (rotation vectors away from the starts, places of the query centroid), Adam's moments, steps done."""
     places = poses.transform(starts, jnp.mean(query, axis=0)[None])[..., 0, :]
     variables = (jnp.zeros_like(places), places)
-    return starts, (variables, optax.scale_by_adam().init(variables), jnp.zeros((), jnp.int32))
+    return variables, optax.scale_by_adam().init(variables), jnp.zeros((), jnp.int32)
 
 
 def _poses(variables, start_rotations, query):

@@ -58,12 +58,12 @@ def energies(field, reference):
 @pytest.mark.parametrize(("fix_last", "chunk"), [(True, 64), (True, 2), (False, 64)])
 def test_the_chunked_gradient_is_that_of_the_energy(field, reference, energies, fix_last, chunk):
     """After one step, Adam's first moments are a tenth of the gradient. 9 or 12 poses: with and without a remainder."""
-    given = random_starts(KEY, field, reference, 3, "scattered", 0.1)
-    starts, state = _begin(given, None, reference.query)
+    starts = random_starts(KEY, field, reference, 3, "scattered", 0.1)
+    state = _begin(starts, reference.query)
     weights = jax.tree.map(jnp.float32, WEIGHTS)
     rates = jnp.array([0.1, 0.01, 0.05, 5.0])
     (_, adam, _), losses = _run(state, starts, field, reference, weights, rates, 1, fix_last=fix_last, chunk=chunk)
-    values, gradients = energies(given)
+    values, gradients = energies(starts)
     np.testing.assert_allclose(losses[:, 0], values, rtol=1e-5)
     for moment, gradient in zip(adam.mu, gradients, strict=True):
         expected = gradient.at[:, -1].set(0.0) if fix_last else gradient
@@ -300,7 +300,8 @@ def test_memory_does_not_grow_with_the_number_of_starts(quick_compilation):
         params = unflatten_dict({name: array(*shape) for name, shape in parameter_shapes(config).items()}, sep=".")
         conditioned = jax.eval_shape(lambda params, z: condition(params, config, z), params, array(64, 3))
         reference = Reference(array(7, 64, config.channels), tdf.Trajectory(array(7, 7)), array(64, 3))
-        starts, state = jax.eval_shape(_begin, array(inits, 7, 7), array(7), reference.query)
+        starts = array(inits, 7, 7)
+        state = jax.eval_shape(_begin, starts, reference.query)
         weights = jax.tree.map(lambda _: array(), WEIGHTS)
         steps = jax.ShapeDtypeStruct((), jnp.int32)
         lowered = _run.lower(
