@@ -1,1 +1,1 @@
-"""Timings of tdf_jax. Each file prints the machine, measures in one run, and is called by name: `python -m bench.landscape`."""
+"""Timings of tdf_jax, in one run and in turns: `python -m bench` against PyTorch, `python -m bench.landscape` against itself."""

@@ -1,0 +1,61 @@
+"""What must hold before anything is timed: the peer is the original network, and both sides have the same energies and gradients."""
+
+from pathlib import Path
+
+import numpy as np
+
+import tdf_jax as tdf
+from bench import scene
+from bench.measure import check, difference
+from bench.workers import Workers
+from tdf_jax.errors import InputError
+
+GOLDEN = Path(__file__).resolve().parents[1] / "tests" / "fixtures" / "ndf_latent32"
+ORIGINAL = {"float32": 5e-5, "float64": 1e-10}  # found: up to 1.8e-5 and 2e-14
+ENERGIES, GRADIENTS = 1e-5, 1e-3  # an absolute difference's derivative is a sign, and rounding turns some of them
+
+
+def parity(workers: Workers, inits: int = 3, poses: int = 7, queries: int = 100) -> list[dict]:
+    """All checks, by the competitors' own processes.
+
+    Args:
+        workers: the competitors' processes.
+        inits, poses, queries: sizes of the energies that are compared.
+
+    Raises:
+        InputError: the golden outputs are not there.
+    """
+    return original(workers) + energies(workers, inits, poses, queries)
+
+
+def original(workers: Workers) -> list[dict]:
+    """The peer's latents, descriptors and occupancies against those of the published code."""
+    if not GOLDEN.with_suffix(".npz").exists():
+        raise InputError(f"parity(): there are no golden outputs {GOLDEN}.npz; expected a checkout of the repository with its tests")
+    state = scene.weights(tdf.convert_checkpoint(GOLDEN.with_suffix(".pth")))
+    with np.load(GOLDEN.with_suffix(".npz")) as stored:
+        arrays = {name: stored[name] for name in ("point_cloud", "coords", "latent", "features", "occupancy")}
+    inputs = {name: arrays[name] for name in ("point_cloud", "coords")}
+    checks = []
+    for precision, tolerance in ORIGINAL.items():
+        settings = {"double": precision == "float64"}
+        workers.ask("torch", "prepare", {"task": "golden", "settings": settings, "arrays": inputs, "state": state})
+        found = workers.ask("torch", "run")["result"]
+        names = ("latent", "features", "occupancy")
+        checks += [check(f"original, {name}, {precision}", difference(found[name], arrays[name]), tolerance) for name in names]
+    return checks
+
+
+def energies(workers: Workers, inits: int, poses: int, queries: int) -> list[dict]:
+    """Energies of random starts and their gradients, every competitor against the first."""
+    state, arrays = scene.weights(tdf.load_model("mug")), scene.imitation(inits, poses, queries)
+    found = {}
+    for name in ("torch", "torch_tuned", "tdf_jax"):
+        workers.ask(name, "prepare", {"task": "gradient", "settings": {}, "arrays": arrays, "state": state})
+        found[name] = workers.ask(name, "run")["result"]
+    expected = found.pop("torch")
+    return [
+        check(f"{kind}, {name} and torch", difference(result[kind], expected[kind]), ENERGIES if kind == "energies" else GRADIENTS)
+        for name, result in found.items()
+        for kind in expected
+    ]

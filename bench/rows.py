@@ -1,0 +1,192 @@
+"""The rows: what is measured, at which sizes, and what must agree."""
+
+import dataclasses
+import importlib.util
+
+import numpy as np
+
+import tdf_jax as tdf
+from bench import flops, machine, scene
+from bench.measure import OURS, PEERS, Plan, Row, check, difference
+from tdf_jax import lattice
+from tdf_jax.errors import InputError
+
+NDF_RATES = {"rotation_rate": 0.01, "translation_rate": 0.01, "final_rate": 1.0}  # NDF's Adam, 1e-2 throughout
+POINT_BYTES = {"torch": 95e3, "torch_tuned": 120e3}  # of one query point's graph; measured 87 and 104 kB, tuned heaps have holes
+MEMORY_SHARE = 0.8  # of the available memory
+LATENTS, LOSSES, VALUES = 1e-4, 1e-3, 1e-4  # Adam's first steps follow signs, which rounding turns
+PROBED = 3  # steps from which the 100 of PyTorch as users run it are estimated: all of them would take minutes
+
+
+@dataclasses.dataclass(frozen=True)
+class Sizes:
+    """Sizes of all rows."""
+
+    clouds: tuple[int, ...] = (1000, 1500)
+    inits: tuple[int, ...] = (1, 10, 64)
+    poses: int = 7
+    queries: int = 500
+    target_inits: int = 10
+    iterations: int = 100  # NDF's, which make the target
+    our_iterations: int = 100
+    grid: int = 11
+    rotations: int = 4
+    lattice: tuple[int, int, int] = (6, 6, 7)
+    pitch: float = 0.012  # metres
+    batch: tuple[int, int, int] = (8, 256, 1024)  # clouds, points, queries
+
+
+QUICK = Sizes(
+    clouds=(60,), inits=(2,), poses=3, queries=16, target_inits=2, iterations=4, our_iterations=60,
+    grid=3, rotations=2, lattice=(2, 2, 3), batch=(2, 40, 32),
+)  # fmt: skip
+
+
+def rows(sizes: Sizes) -> list[Row]:
+    """All rows."""
+    found = [encoding(points) for points in sizes.clouds]
+    found += [step(inits, sizes.poses, sizes.queries) for inits in sizes.inits]
+    return [*found, target(sizes), target(sizes, same_rates=True), sweeping(sizes), training(sizes)]
+
+
+def select(found: list[Row], names: list[str] | None) -> list[Row]:
+    """Rows by name, or all.
+
+    Raises:
+        InputError: an unknown name.
+    """
+    unknown = set(names or ()) - {row.name for row in found}
+    if unknown:
+        raise InputError(f"bench: --only {', '.join(sorted(unknown))}; expected some of {', '.join(row.name for row in found)}")
+    return [row for row in found if not names or row.name in names]
+
+
+def agree(tolerances: dict[str, float]):
+    """A check: every result is the first competitor's, as far as both go (some take fewer starts or steps)."""
+
+    def checks(results):
+        (first, expected), *others = results.items()
+        found = []
+        for name, result in others:
+            for key, tolerance in tolerances.items():
+                common = tuple(slice(0, min(a, b)) for a, b in zip(np.shape(result[key]), np.shape(expected[key])))
+                found.append(check(f"{key}, {name} and {first}", difference(result[key][common], expected[key][common]), tolerance))
+        return found, {}
+
+    return checks
+
+
+def encoding(points: int) -> Row:
+    """The latent of one cloud, whole."""
+    plans = {name: Plan("encode") for name in (*PEERS, "tdf_jax")}
+    sizes = {"points": points}
+    title = f"encode {points} points"
+    return Row(f"encode_{points}", title, sizes, lambda: {"cloud": scene.cloud(points)}, plans, agree({"latent": LATENTS}), flops.encoder(points))
+
+
+def fitting(name: str, inits: int, poses: int, queries: int) -> int:
+    """The largest number of starts, up to `inits`, whose graph fits into the memory that is available now."""
+    return max(1, min(inits, int(MEMORY_SHARE * machine.available() / (POINT_BYTES[name] * poses * queries))))
+
+
+def step(inits: int, poses: int, queries: int) -> Row:
+    """Energy and gradient of all starts, and Adam's update; no pose is fixed."""
+    peer_steps, our_steps = {1: (5, 20)}.get(inits, (2, 4) if inits <= 10 else (1, 2))
+
+    def settings(steps):
+        return NDF_RATES | {"steps": steps, "iterations": steps, "fix_last": False, "per": "step"}
+
+    plans = {}
+    for name in PEERS:
+        fit = fitting(name, inits, poses, queries)
+        note = "" if fit == inits else f"{fit} starts, the most that fit into memory; time x {inits}/{fit}"
+        plans[name] = Plan("descent", settings(peer_steps), fit, once=name == "torch" and inits > 10, scale=inits / fit, note=note)
+    plans["tdf_jax"] = Plan("descent", settings(our_steps))
+    title = f"one step, {inits} x {poses} x {queries}"
+    sizes = {"inits": inits, "poses": poses, "queries": queries}
+    work = flops.decoder_gradient(inits * poses * queries)
+    return Row(
+        f"step_{inits}", title, sizes, lambda: scene.imitation(inits, poses, queries), plans, agree({"losses": LOSSES}), work,
+        most=3 if inits > 10 else 100,
+    )  # fmt: skip
+
+
+def target(sizes: Sizes, same_rates: bool = False) -> Row:
+    """Time to the energy that PyTorch's best start has after its steps.
+
+    PyTorch takes NDF's rates, or, as its expert might, those of `tdf.optimize`. Our whole calls count, with default settings; that
+    they reach the target is a check in the first case, and a fact in the second.
+    """
+    inits, n, queries, iterations = sizes.target_inits, sizes.poses, sizes.queries, sizes.iterations
+    default = tdf.OptimizeConfig()
+    our_rates = {name: getattr(default, name) for name in NDF_RATES}
+    common = {"iterations": iterations, "fix_last": True, "per": "call"}
+    common |= our_rates if same_rates else NDF_RATES
+    probed = min(PROBED, iterations)
+    plans = {
+        "torch": Plan(
+            "descent", common | {"steps": probed}, scale=iterations / probed, note=f"{probed} steps measured, time x {iterations}/{probed}"
+        ),
+        "torch_tuned": Plan("descent", common | {"steps": iterations}, once=True),
+        "tdf_jax": Plan("descent", common | our_rates | {"iterations": iterations if same_rates else sizes.our_iterations}, once=same_rates),
+    }
+    if importlib.util.find_spec("tdf_jax.solve"):
+        plans["tdf_jax_solve"] = Plan("solving", {"fix_last": True}, once=same_rates)
+    if same_rates:
+        del plans["torch"]  # its steps take the same time at any rates
+
+    def reached(results):
+        found, facts = ([], {}) if same_rates else agree({"losses": LOSSES})({name: results[name] for name in PEERS if name in results})
+        energies = {name: float(np.min(result["energies"])) for name, result in results.items() if "energies" in result}
+        facts |= {"energies": energies}
+        if "torch_tuned" not in energies:
+            return found, facts
+        goal = facts["target"] = energies["torch_tuned"]
+        if "tdf_jax" in results:
+            below = np.flatnonzero(np.min(results["tdf_jax"]["losses"], axis=0) <= goal)
+            facts["tdf_jax_steps"] = int(below[0]) if len(below) else None
+        for name, energy in energies.items():
+            if name in OURS and not same_rates:
+                found.append(check(f"energy above the target's, {name}", energy - goal, 0.0))
+        return found, facts
+
+    one = flops.decoder_gradient(inits * (n - 1) * queries)
+    work = {name: one * plan.settings.get("iterations", 0) for name, plan in plans.items()}  # `solve` counts its own evaluations
+    rates = "tdf_jax's rates" if same_rates else "NDF's rates"
+    title = f"to the energy of {iterations} steps at {rates}, {inits} x {n} x {queries}"
+    about = {"inits": inits, "poses": n, "queries": queries, "iterations": iterations}
+    name = "target_rates" if same_rates else "target"
+    return Row(name, title, about, lambda: scene.imitation(inits, n, queries), plans, reached, work, most=2)
+
+
+def sweeping(sizes: Sizes) -> Row:
+    """Energies of a lattice of query points over a plane in several orientations, half of them along the grid."""
+
+    def arrays():
+        return scene.sweep(sizes.grid, sizes.rotations, sizes.poses, sizes.lattice, sizes.pitch)
+
+    settings = {"count": sizes.grid, "pitch": sizes.pitch}
+    plans = {name: Plan("landscape", settings) for name in (*PEERS, "tdf_jax")}
+    made = arrays()
+    grid, query = scene.plane(sizes.grid, sizes.pitch, made["new"]), np.asarray(made["query"], float)
+    shared = sum(lattice.evaluations(grid, lattice.layers(grid, query @ R.T)) for R in made["rotations"].astype(float))
+    direct = sizes.grid**2 * len(query) * sizes.rotations
+    work = dict.fromkeys(PEERS, flops.decoder(direct)) | {"tdf_jax": flops.decoder(shared)}
+
+    def values(results):
+        checks, facts = agree({"values": VALUES})(results)
+        return checks, facts | {"evaluations": {"one by one": direct, "tdf_jax": shared}}
+
+    about = {"points": sizes.grid**2, "rotations": sizes.rotations, "queries": len(query), "poses": sizes.poses}
+    title = f"landscape, {about['points']} points x {about['rotations']} rotations x {about['queries']} queries x {about['poses']} waypoints"
+    return Row("landscape", title, about, arrays, plans, values, work)
+
+
+def training(sizes: Sizes) -> Row:
+    """Steps on the weights."""
+    clouds, points, queries = sizes.batch
+    plans = {name: Plan("train", {"steps": 2, "rate": 1e-4}) for name in (*PEERS, "tdf_jax")}
+    title = f"training step, {clouds} clouds x {points} points, {queries} queries"
+    about = {"clouds": clouds, "points": points, "queries": queries}
+    work = flops.training(clouds, points, queries)
+    return Row("train", title, about, lambda: scene.batch(clouds, points, queries), plans, agree({"losses": LOSSES}), work)
