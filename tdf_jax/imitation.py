@@ -12,6 +12,7 @@ from tdf_jax.errors import InputError
 from tdf_jax.keys import check_key
 from tdf_jax.model import Model, encode
 from tdf_jax.optimize import OptimizeConfig, Result, default_goal, optimize
+from tdf_jax.solve import SolveConfig, solve
 
 
 def imitate(
@@ -24,7 +25,7 @@ def imitate(
     goal_offset: Float[Array, "3"] | None = None,
     fix_last: bool = True,
     energy: EnergyWeights = EnergyWeights(),
-    config: OptimizeConfig = OptimizeConfig(),
+    config: SolveConfig | OptimizeConfig = SolveConfig(),
     progress: Callable | None = None,
 ) -> Result:
     """Imitate a demonstrated trajectory on a new object of the same category.
@@ -40,11 +41,11 @@ def imitate(
         goal_offset: world vector added to the goal's translation, metres.
         fix_last: keep the last pose at the goal.
         energy: weights of the terms.
-        config: settings of the optimiser.
-        progress: see `optimize`.
+        config: settings of the solver, or, for Adam as in the paper and for energies with eq. 6, of `optimize`.
+        progress: see `solve` and `optimize`.
 
     Returns:
-        Every start's result; `.trajectory` is the best one, T_world_query.
+        The result; `.trajectory` is the best one, T_world_query.
 
     Raises:
         InputError: bad points, goal or offset.
@@ -55,9 +56,8 @@ def imitate(
     goal = default_goal(field, reference) if goal is None else _finite("goal", goal, (7,))
     if goal_offset is not None:
         goal = goal + jnp.pad(_finite("goal_offset", goal_offset, (3,)), (4, 0))
-    return optimize(
-        field, reference, key, goal=goal, fix_last=fix_last, energy=energy, config=config, progress=progress
-    )
+    minimise = optimize if isinstance(config, OptimizeConfig) else solve
+    return minimise(field, reference, key, goal=goal, fix_last=fix_last, energy=energy, config=config, progress=progress)
 
 
 def imitate_batch(

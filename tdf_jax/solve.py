@@ -140,15 +140,15 @@ def solve(
             the stage and without a fixed last pose (of the first two, those of the keyframe); may raise to cancel.
 
     Returns:
-        A result whose rows are trajectories of the best, second best, ... candidates of each waypoint. Its `starts` and `losses` are those
-        of the last stage.
+        A result whose rows are trajectories of the best, second best, ... candidates of each waypoint. Its `losses` are theirs from the search on,
+        before the last stage on the few query points; its `starts` are where the last stage began, `steps[-1]` steps before the end.
 
     Raises:
         InputError: as for `optimize`, or a weight on eq. 6, which couples the waypoints.
     """
     if np.any(np.asarray(energy.compensator) != 0):
         raise InputError(
-            f"solve(): energy.compensator is {energy.compensator}; expected 0, for the solver takes waypoints one by one. Use optimize()"
+            f"solve(): energy.compensator is {energy.compensator}; expected 0, for the solver takes waypoints one by one. Use optimize(), or imitate() with config=OptimizeConfig()"
         )
     most = dataclasses.replace(config, inits=max(config.inits, config.scouts))
     given = starts is not None
@@ -173,28 +173,39 @@ def solve(
             progress(sum(config.steps[: index + 1]), np.sort(found.energy, axis=0)[:kept].mean(axis=1))
         return found, fixed
 
+    def curve(found, *others):
+        """Energies of the best candidates of each waypoint during a stage, among them others that stand still, (times, kept)."""
+        rows = np.concatenate([found.history, *(np.broadcast_to(other, (len(found.history), *other.shape)) for other in others)], axis=1)
+        return np.sort(rows, axis=1)[:, np.minimum(np.arange(kept), rows.shape[1] - 1)].sum(axis=2)
+
     keyframe = int(np.linalg.norm(_candidates(problem.target, problem).place[:free], axis=1).argmin())
     alone = [keyframe]
     found, _ = stage(0, Candidates(drawn.R[:scouts, alone], drawn.place[:scouts, alone]), waypoints=alone)
+    curves = [curve(found)]
     found, _ = stage(1, _distinct(found, max(kept, scouts // 4)), waypoints=alone)
+    curves.append(curve(found))
     if free > 1:
         picked = _distinct(found, kept)
         found, _ = stage(2, Candidates(drawn.R[:inits, :free], drawn.place[:inits, :free]))
+        curves = [curve(found)]
         carried, _ = stage(3, _carried(found, picked, keyframe, problem, field.origin))
+        curves.append(curve(carried, found.energy))
         found = Candidates(*(np.concatenate(pair) for pair in zip(found[:3], carried[:3])))
     found, _ = stage(4, _distinct(found, kept))
+    curves.append(curve(found))
     begun = _distinct(found, kept)
     found, fixed = stage(5, begun, fixed=(drawn.R[0, free:], drawn.place[0, free:]))
 
     order = np.argsort(found.energy, axis=0)
     rows = Candidates(*(np.take_along_axis(part, _like(order, part), axis=0) for part in (found.R, found.place)))
     begun = Candidates(*(np.take_along_axis(part, _like(order, part), axis=0) for part in begun[:2]))
-    history = (np.take_along_axis(found.history, order[None], axis=1).sum(axis=2) + fixed) / n
+    curves.append(np.take_along_axis(found.history, order[None], axis=1).sum(axis=2))
+    losses = (np.concatenate([*(stage[:-1] for stage in curves[:-1]), curves[-1]]) + fixed) / n
     trajectories, begun = (
         jnp.concatenate([_poses(part, problem), jnp.broadcast_to(starts[:1, free:], (len(order), n - free, 7))], axis=1)
         for part in (rows, begun)
     )
-    losses = jnp.asarray(history.T, starts.dtype)
+    losses = jnp.asarray(losses.T, starts.dtype)
     return Result(trajectories, losses[:, :-1], losses[:, -1], begun)
 
 

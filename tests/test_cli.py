@@ -19,7 +19,7 @@ from tdf_jax.evaluation.truth import pose_error
 from tdf_jax.recording import save_demonstration
 from tdf_jax.shapes import build_mug
 
-QUICK = ("--inits", 2, "--iterations", 3, "--points", 60)
+QUICK = ("--method", "adam", "--inits", 2, "--iterations", 3, "--points", 60)
 TINY = (*QUICK, "--poses", 4, "--queries", 8)
 FILES = {"result.json", "trajectory.npz", "trajectory.tum", "imitation.png", "loss.png"}
 
@@ -94,6 +94,15 @@ def record_of(folder):
 # What a run writes
 
 
+def test_the_default_method_is_the_solver(imitate, watched, capsys):
+    record = imitate("--points", 60, "--poses", 4, "--queries", 8, "--inits", 2)
+    assert record["settings"]["method"] == "gauss-newton" and record["settings"]["iterations"] is None
+    assert tuple(record["optimiser"]["steps"]) == tdf.SolveConfig().steps and record["optimiser"]["inits"] == 2
+    np.testing.assert_array_equal(np.float32(record["energies"]), watched[0].energies)
+    out = capsys.readouterr().out
+    assert "2 starts, 4 poses, 8 queries, 64 starts of the keyframe" in out and "the best candidate of every waypoint" in out
+
+
 def test_a_run_writes_every_file_and_nothing_beside_them(folder):
     assert {path.name for path in folder.iterdir()} == FILES
     assert [path.name for path in folder.parent.iterdir()] == ["out"]
@@ -106,7 +115,7 @@ def test_the_record_tells_all_settings(folder, weights):
     assert (record["schema"], record["tdf_jax"], record["seed"]) == (report.SCHEMA, tdf.__version__, 0)
     assert record["settings"] == {
         "target": None, "scale": 1.0, "target_pose": "random", "demonstration": None, "trajectory": "wave",
-        "goal_offset": [0.0, 0.0, 0.0], "k": 0.02, "inits": 2, "poses": 4, "queries": 8, "iterations": 3, "points": 60,
+        "goal_offset": [0.0, 0.0, 0.0], "k": 0.02, "method": "adam", "inits": 2, "poses": 4, "queries": 8, "iterations": 3, "points": 60,
         "seed": 0, "weights": str(weights), "out": str(folder), "no_plots": False, "json": False,
     }  # fmt: skip
     assert record["energy"] == dataclasses.asdict(tdf.EnergyWeights(0.02))
@@ -340,7 +349,8 @@ def test_bad_target_files(refusal, weights, tmp_path, name):
     (("--k", "nan"), "--k is nan"),
     (("--poses", "1"), "poses is 1; expected a whole number of at least 2"),
     (("--inits", "0"), "inits is 0"),
-    (("--iterations", "0"), "iterations is 0"),
+    (("--method", "adam", "--iterations", "0"), "iterations is 0"),
+    (("--iterations", "50"), "--iterations is for --method adam"),
     (("--queries", "0"), "count is 0"),
     (("--points", "20"), "20 points"),
     (("--seed", "-1"), "--seed is -1"),

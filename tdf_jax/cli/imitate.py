@@ -18,10 +18,12 @@ from tdf_jax.cli.scene import make_scene
 from tdf_jax.cli.settings import Settings, resolved
 from tdf_jax.demonstration import describe
 from tdf_jax.energy import EnergyWeights
+from tdf_jax.errors import InputError
 from tdf_jax.evaluation.scene import Scene
 from tdf_jax.files import replace_file, replace_folder
 from tdf_jax.imitation import imitate as imitate_scene
 from tdf_jax.optimize import OptimizeConfig, Result
+from tdf_jax.solve import SolveConfig
 from tdf_jax.trajectory import save_trajectory
 
 # Folded into the seed's key: `random_pose` draws a generated mug's rotation from the key of the same seed, and a start
@@ -47,12 +49,12 @@ def _run(settings: Settings, folder: Path) -> dict:
     query_key, start_key = jax.random.split(jax.random.fold_in(jax.random.key(settings.seed), STREAM))
     with _timed(seconds, "load"):
         energy = EnergyWeights(settings.k)
-        config = OptimizeConfig(inits=settings.inits, iterations=settings.iterations)
+        config = _config(settings)
         model = load_model(settings.weights)
         scene = make_scene(settings, query_key)
     with _timed(seconds, "encode"):
         reference = jax.block_until_ready(describe(model, scene.demonstration))
-    with _timed(seconds, "optimise"), _progress(settings.iterations) as progress:
+    with _timed(seconds, "optimise"), _progress(_steps(config)) as progress:
         result = imitate_scene(
             model,
             reference,
@@ -73,6 +75,18 @@ def _run(settings: Settings, folder: Path) -> dict:
     record = report.record(settings, model, scene, energy, config, result, seconds)
     replace_file("tdf imitate", folder / report.RESULT, json.dumps(record, indent=1).encode())
     return record
+
+
+def _config(settings: Settings) -> SolveConfig | OptimizeConfig:
+    if settings.method == "adam":
+        return OptimizeConfig(inits=settings.inits, iterations=100 if settings.iterations is None else settings.iterations)
+    if settings.iterations is not None:
+        raise InputError("tdf imitate: --iterations is for --method adam; drop one or add the other")
+    return SolveConfig(inits=settings.inits)
+
+
+def _steps(config: SolveConfig | OptimizeConfig) -> int:
+    return config.iterations if isinstance(config, OptimizeConfig) else sum(config.steps)
 
 
 def _draw(folder: Path, scene: Scene, result: Result) -> None:

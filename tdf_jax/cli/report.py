@@ -90,9 +90,11 @@ def table(record: dict, out: Path) -> str:
     if found is not None:
         pick = f"{100 * found['pick_metres']:.2f} cm, {np.degrees(found['pick_radians']):.1f} degrees"
         path = f"{100 * found['path_metres']:.2f} cm, mean over waypoints"
-    best = f"start {record['best'] + 1} of {sizes['inits']}; {record['status']}"
+    solved = "scouts" in sizes
+    steps = "{scouts} starts of the keyframe" if solved else "{iterations} iterations"
+    best = "the best candidate of every waypoint" if solved else f"start {record['best'] + 1} of {sizes['inits']}; {record['status']}"
     rows = {
-        "run": "{inits} starts, {poses} poses, {queries} queries, {iterations} iterations".format(**sizes),
+        "run": f"{{inits}} starts, {{poses}} poses, {{queries}} queries, {steps}".format(**sizes),
         "loss, start": f"{record['loss']['start']:.5f}",
         "loss, end": f"{record['loss']['end']:.5f} ({best})",
         "pick-pose error": pick,

@@ -56,8 +56,9 @@ class Settings(SceneSettings):
     Attributes:
         goal_offset: metres in the world, added to where the last pose goes.
         k: weight of the correlation term; the paper's best is 0.02.
+        method: damped Gauss-Newton steps, or Adam's as in the paper.
         inits: random starts.
-        iterations: optimisation steps.
+        iterations: Adam's steps.
         out: folder to write; an earlier result there is replaced.
         no_plots: leave out imitation.png and loss.png.
         json: print result.json instead of the table.
@@ -65,8 +66,9 @@ class Settings(SceneSettings):
 
     goal_offset: Annotated[tuple[float, float, float], _option("X Y Z")] = (0.0, 0.0, 0.0)
     k: float = 0.02
+    method: Literal["gauss-newton", "adam"] = "gauss-newton"
     inits: int = 10
-    iterations: int = 100
+    iterations: Annotated[int | None, _option("INT", "100")] = None
     out: Annotated[Path, _option("DIR")] = Path("imitation")
     no_plots: bool = False
     json: bool = False
