@@ -352,7 +352,8 @@ def _evaluator(starts, field, reference, energy, fix_last, chunk):
     def evaluate(variables):
         indices = jnp.tile(jnp.arange(free), inits)
         inputs = (jax.tree.map(flat, variables), flat(start_rotations), indices)
-        losses, gradient = jax.lax.map(indexed, inputs, batch_size=chunk)
+        # One pose at a time is mapped plainly: a batch of one took 15 ms a pose of 500 query points instead of 8.5.
+        losses, gradient = jax.lax.map(indexed, inputs, batch_size=chunk if chunk > 1 else None)
         remaining, remaining_gradient = jax.vmap(jax.value_and_grad(rest))(variables, start_rotations)
         mask = (jnp.arange(n) < free)[:, None]
         gradient = jax.tree.map(
