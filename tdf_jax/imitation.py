@@ -27,6 +27,7 @@ def imitate(
     energy: EnergyWeights = EnergyWeights(),
     config: SolveConfig | OptimizeConfig = SolveConfig(),
     progress: Callable | None = None,
+    mesh: jax.sharding.Mesh | None = None,
 ) -> Result:
     """Imitate a demonstrated trajectory on a new object of the same category.
 
@@ -42,7 +43,7 @@ def imitate(
         fix_last: keep the last pose at the goal.
         energy: weights of the terms.
         config: settings of the solver, or, for Adam as in the paper and for energies with eq. 6, of `optimize`.
-        progress: see `solve` and `optimize`.
+        progress, mesh: see `solve` and `optimize`.
 
     Returns:
         The result; `.trajectory` is the best one, T_world_query.
@@ -57,7 +58,7 @@ def imitate(
     if goal_offset is not None:
         goal = goal + jnp.pad(_finite("goal_offset", goal_offset, (3,)), (4, 0))
     minimise = optimize if isinstance(config, OptimizeConfig) else solve
-    return minimise(field, reference, key, goal=goal, fix_last=fix_last, energy=energy, config=config, progress=progress)
+    return minimise(field, reference, key, goal=goal, fix_last=fix_last, energy=energy, config=config, progress=progress, mesh=mesh)
 
 
 def imitate_batch(

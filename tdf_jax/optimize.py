@@ -15,7 +15,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from tdf_jax import poses
+from tdf_jax import devices, poses
 from tdf_jax.demonstration import Reference
 from tdf_jax.energy import EnergyWeights, pose_energy, waypoint_loss
 from tdf_jax.errors import InputError
@@ -137,6 +137,7 @@ def optimize(
     config: OptimizeConfig = OptimizeConfig(),
     starts: Float[Array, "inits poses 7"] | None = None,
     progress: Callable[[int, Float[np.ndarray, "inits"]], None] | None = None,
+    mesh: jax.sharding.Mesh | None = None,
 ) -> Result:
     """Minimise `trajectory_energy` from many starts.
 
@@ -153,6 +154,7 @@ def optimize(
         config: settings.
         starts: use these instead of random ones; their last poses are replaced by the goal only where one is given.
         progress: called between blocks of iterations with the iterations done and the energies; may raise to cancel.
+        mesh: devices to share the starts, of this process or of several that make the same call; see docs/scaling.md.
 
     Returns:
         All starts' results.
@@ -161,22 +163,26 @@ def optimize(
         InputError: starts, goal or weights of a wrong shape or value, or a reference from another network than the field.
     """
     starts, energy = prepare("optimize()", field, reference, key, goal, energy, config, starts)
-    dtype = starts.dtype
+    inits, dtype = len(starts), starts.dtype
+    count = config.chunk or max(1, devices.points_at_a_time(CHUNK_POINTS) // len(reference.query))
+    program = functools.partial(_run, fix_last=fix_last, chunk=count, mesh=mesh)
+    rates = np.array([config.rotation_rate, config.translation_rate, config.final_rate, config.iterations], dtype)
+    if mesh is not None:
+        starts = devices.placed(devices.padded(starts, mesh), mesh, devices.split(mesh))
+        field, reference, energy, rates = devices.placed((field, reference, energy, rates), mesh)
     state = _begin(starts, reference.query)
-    count = config.chunk or max(1, CHUNK_POINTS // len(reference.query))
-    program = functools.partial(_run, fix_last=fix_last, chunk=count)
-    rates = jnp.asarray([config.rotation_rate, config.translation_rate, config.final_rate, config.iterations], dtype)
     losses = []
     for done in range(0, config.iterations, BLOCK):
         steps = min(BLOCK, config.iterations - done)
         state, block = program(state, starts, field, reference, energy, rates, steps)
         losses.append(block[:, :steps])
         if progress is not None:
-            progress(done + steps, np.asarray(block[:, steps - 1]))
+            progress(done + steps, devices.gathered(block)[:inits, steps - 1])
     trajectories = _trajectories(state, starts, reference.query, fix_last=fix_last)
     # One more step, not kept: the energies after the last one, by the program that is compiled already.
     _, block = program(state, starts, field, reference, energy, rates, 1)
-    return Result(trajectories, jnp.concatenate(losses, axis=1), block[:, 0], starts)
+    result = Result(trajectories, jnp.concatenate(losses, axis=1), block[:, 0], starts)
+    return result if mesh is None else jax.tree.map(lambda part: jnp.asarray(devices.gathered(part)[:inits]), result)
 
 
 def prepare(
@@ -290,8 +296,17 @@ def _poses(variables, start_rotations, query):
     return R, place - poses.rotate(R, jnp.mean(query, axis=0)[None])[..., 0, :]
 
 
-@functools.partial(jax.jit, static_argnames=("fix_last", "chunk"), donate_argnums=0)
-def _run(state, starts, field, reference, energy, rates, steps, *, fix_last, chunk):
+@functools.partial(jax.jit, static_argnames=("fix_last", "chunk", "mesh"), donate_argnums=0)
+def _run(state, starts, field, reference, energy, rates, steps, *, fix_last, chunk, mesh=None):
+    work = functools.partial(_steps, fix_last=fix_last, chunk=chunk)
+    if mesh is not None:
+        split, whole = devices.split(mesh), devices.WHOLE
+        states = split, optax.ScaleByAdamState(whole, split, split), whole
+        work = jax.shard_map(work, mesh=mesh, in_specs=(states, split, *[whole] * 5), out_specs=(states, split), check_vma=False)
+    return work(state, starts, field, reference, energy, rates, steps)
+
+
+def _steps(state, starts, field, reference, energy, rates, steps, *, fix_last, chunk):
     evaluate = _evaluator(starts, field, reference, energy, fix_last, chunk)
     rotation_rate, translation_rate, final_rate, iterations = rates
 

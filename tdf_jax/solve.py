@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from tdf_jax import poses
+from tdf_jax import devices, poses
 from tdf_jax.demonstration import Reference
 from tdf_jax.energy import EnergyWeights, pose_difference
 from tdf_jax.errors import InputError
@@ -55,6 +55,7 @@ class SolveConfig:
         finalists: distinct candidates of each waypoint that are refined and polished.
         tolerance: a stage ends when no pose's next step promises to lower its energy by more than this share of it.
         start, start_radius: as for `OptimizeConfig`.
+        chunk: query points evaluated at a time; None chooses. Changes speed and memory, not the result.
     """
 
     inits: int = 10
@@ -65,10 +66,11 @@ class SolveConfig:
     tolerance: float = 1e-3
     start: str = "carried"
     start_radius: float = 0.1
+    chunk: int | None = None
 
     def __post_init__(self):
-        for name in ("inits", "scouts", "points", "finalists"):
-            if not _counts(getattr(self, name)):
+        for name in ("inits", "scouts", "points", "finalists", "chunk"):
+            if not _counts(getattr(self, name)) and (name, getattr(self, name)) != ("chunk", None):
                 raise InputError(f"SolveConfig(): {name} is {getattr(self, name)!r}; expected a whole number of at least 1")
         if len(self.steps) != len(FIRST_DAMPINGS) or not all(map(_counts, self.steps)):
             raise InputError(f"SolveConfig(): steps is {self.steps!r}; expected six whole numbers of at least 1")
@@ -129,6 +131,7 @@ def solve(
     config: SolveConfig = SolveConfig(),
     starts: Float[Array, "inits poses 7"] | None = None,
     progress: Callable[[int, Float[np.ndarray, "finalists"]], None] | None = None,
+    mesh: jax.sharding.Mesh | None = None,
 ) -> Result:
     """Minimise `trajectory_energy` by damped Gauss-Newton steps from many starts, in six stages (see the module).
 
@@ -138,6 +141,7 @@ def solve(
         starts: use these instead of random ones, all of them as scouts and in the search.
         progress: called after each stage with the steps done and the energies of the best trajectories so far, on the query points of
             the stage and without a fixed last pose (of the first two, those of the keyframe); may raise to cancel.
+        mesh: devices to share the candidates, of this process or of several that make the same call; see docs/scaling.md.
 
     Returns:
         A result whose rows are trajectories of the best, second best, ... candidates of each waypoint. Its `losses` are theirs from the search on,
@@ -165,7 +169,10 @@ def solve(
     drawn = _candidates(starts, problem)
     scouts, inits, kept = (len(starts),) * 2 + (config.finalists,) if given else (config.scouts, config.inits, config.finalists)
     room = max(scouts, max(inits, free + kept + 1) * free + 1)
-    run = functools.partial(_run, field=field, problem=problem, energy=energy, config=config, room=room)
+    shared, parts = (field, problem, energy), 1
+    if mesh is not None:
+        shared, parts = devices.placed(shared, mesh), mesh.size
+    run = functools.partial(_run, shared=shared, config=config, room=-(-room // parts) * parts, mesh=mesh)
 
     def stage(index, candidates, **which):
         found, fixed = run(index, candidates, **which)
@@ -272,7 +279,7 @@ def _distinct(found, kept):
     return Candidates(*(np.stack(part, axis=1) for part in zip(*columns)))
 
 
-def _run(stage, candidates, fixed=None, waypoints=None, *, field, problem, energy, config, room):
+def _run(stage, candidates, fixed=None, waypoints=None, *, shared, config, room, mesh):
     """One stage: where the candidates came to, and the energy of a fixed last pose if there is one, else 0.
 
     The columns of the candidates are all free waypoints, unless others are named.
@@ -286,14 +293,21 @@ def _run(stage, candidates, fixed=None, waypoints=None, *, field, problem, energ
     count = len(R)
     # Every stage runs the same program: arrays of one size, and counts that are traced.
     R, place, waypoint = (np.resize(part, (room, *part.shape[1:])) for part in (R, place, waypoint))
-    blocks = len(problem.query) if stage == len(FIRST_DAMPINGS) - 1 else 1
+    blocks = len(shared[1].query) if stage == len(FIRST_DAMPINGS) - 1 else 1
     bounds = np.array([rows * free, count, blocks, config.steps[stage]], np.int32)
-    R, place, values = _descend(
-        R, place, waypoint, bounds, FIRST_DAMPINGS[stage], field, problem, energy, config.tolerance, length=max(config.steps) + 1
-    )
-    history = np.asarray(values)[: config.steps[stage] + 1]
+    given, limits = (R, place, waypoint), (bounds, R.dtype.type(FIRST_DAMPINGS[stage]), R.dtype.type(config.tolerance))
+    dealt = slice(None)
+    if mesh is not None:
+        # Dealt out in turns, so that every device has its share of those that move.
+        dealt = np.arange(room).reshape(-1, mesh.size).T.ravel()
+        given = devices.placed([part[dealt] for part in given], mesh, devices.split(mesh))
+        limits = devices.placed(limits, mesh)
+    chunk = config.chunk or devices.points_at_a_time(CHUNK_POINTS)
+    results = _descend(*given, *limits, *shared, length=max(config.steps) + 1, chunk=chunk, mesh=mesh)
+    R, place, values = (devices.gathered(part)[np.argsort(dealt)] if mesh is not None else np.asarray(part) for part in results)
+    history = values.T[: config.steps[stage] + 1]
     history = np.where(np.isfinite(history), history, np.inf)
-    ended = [np.asarray(part)[: rows * free].reshape(rows, free, *part.shape[1:]) for part in (R, place)]
+    ended = [part[: rows * free].reshape(rows, free, *part.shape[1:]) for part in (R, place)]
     energies = history[:, : rows * free].reshape(len(history), rows, free)
     return Candidates(*ended, energies[-1], energies), history[-1, rows * free : count].sum()
 
@@ -311,8 +325,8 @@ class _State(NamedTuple):
     hessian: Float[Array, "poses 6 6"]
 
 
-@functools.partial(jax.jit, static_argnames="length")
-def _descend(R, place, waypoint, bounds, damping, field, problem, energy, tolerance, *, length):
+@functools.partial(jax.jit, static_argnames=("length", "chunk", "mesh"))
+def _descend(R, place, waypoint, bounds, damping, tolerance, field, problem, energy, *, length, chunk, mesh=None):
     """Damped Gauss-Newton steps, until none promises to gain by the tolerance.
 
     Args:
@@ -320,19 +334,34 @@ def _descend(R, place, waypoint, bounds, damping, field, problem, energy, tolera
         waypoint: of each pose, what it is to match.
         bounds: how many of the poses move, how many are evaluated, blocks of query points, most steps.
         damping: of the first step.
-        field, problem, energy, tolerance: see `SolveConfig`.
+        tolerance: see `SolveConfig`.
+        field, problem, energy: what is minimised.
         length: times a history has room for.
+        chunk: query points evaluated at a time.
+        mesh: devices that the poses are dealt out to in turns.
 
     Returns:
-        R, place, and energies at the start and after each step, (length, poses); those of steps that were not taken are the latest.
+        R, place, and energies at the start and after each step, (poses, length); those of steps that were not taken are the latest.
     """
+    work = functools.partial(_steps, length=length, chunk=chunk, axes=mesh.axis_names if mesh is not None else ())
+    if mesh is not None:
+        split = devices.split(mesh)
+        work = jax.shard_map(work, mesh=mesh, in_specs=(*[split] * 3, *[devices.WHOLE] * 6), out_specs=split, check_vma=False)
+    return work(R, place, waypoint, bounds, damping, tolerance, field, problem, energy)
+
+
+def _steps(R, place, waypoint, bounds, damping, tolerance, field, problem, energy, *, length, chunk, axes):
+    """`_descend` on one device; `axes` are the mesh's."""
+    if axes:
+        parts, part = jax.lax.axis_size(axes), jax.lax.axis_index(axes)
+        bounds = bounds.at[:2].set((bounds[:2] - part + parts - 1) // parts)  # of the poses dealt out, those of this device
     moving, _, _, steps = bounds
     moves = jnp.arange(len(R)) < moving
 
     def body(carry):
         i, state, damping, step, _, history = carry
         R, place = poses.exp(step[:, :3]) @ state.R, state.place + step[:, 3:]
-        trial = _State(R, place, *_evaluate(R, place, waypoint, bounds, field, problem, energy))
+        trial = _State(R, place, *_evaluate(R, place, waypoint, bounds, field, problem, energy, chunk))
         # The first time nothing has moved and the state's energies are infinite: it takes what is finite.
         better = trial.energy < state.energy
         state = jax.tree.map(lambda a, b: jnp.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b), trial, state)
@@ -340,13 +369,14 @@ def _descend(R, place, waypoint, bounds, damping, field, problem, energy, tolera
         damping = jnp.clip(damping * factor, *DAMPINGS)
         step, promise = _step(state, damping)
         hopeful = jnp.any(moves & (promise > tolerance * state.energy))
-        history = jnp.where((jnp.arange(length) >= i)[:, None], state.energy, history)
+        hopeful = jax.lax.pmax(hopeful.astype(jnp.int32), axes) > 0 if axes else hopeful
+        history = jnp.where(jnp.arange(length) >= i, state.energy[:, None], history)
         return i + 1, state, damping, jnp.where(moves[:, None], step, 0.0), hopeful, history
 
     count, dtype = len(R), R.dtype
     values = jnp.full(count, jnp.inf, dtype), jnp.zeros((count, 6), dtype), jnp.broadcast_to(jnp.eye(6, dtype=dtype), (count, 6, 6))
     begin = _State(R, place, *values), jnp.full(count, damping, dtype), jnp.zeros((count, 6), dtype)
-    carry = (jnp.int32(0), *begin, jnp.bool_(True), jnp.zeros((length, count), dtype))
+    carry = (jnp.int32(0), *begin, jnp.bool_(True), jnp.zeros((count, length), dtype))
     _, state, _, _, _, history = jax.lax.while_loop(lambda carry: (carry[0] <= steps) & carry[4], body, carry)
     return state.R, state.place, history
 
@@ -374,13 +404,13 @@ def _solved(matrix, right):
     return jax.lax.fori_loop(0, 6, eliminate, jnp.concatenate([matrix, right[..., None]], axis=-1))[..., -1]
 
 
-def _evaluate(R, place, waypoint, bounds, field, problem, energy):
+def _evaluate(R, place, waypoint, bounds, field, problem, energy, chunk):
     """Energies of the poses within the bounds and their quadratic models: (poses,), (poses, 6), (poses, 6, 6)."""
     _, last, blocks, _ = bounds
-    count = min(max(1, CHUNK_POINTS // problem.query.shape[1]), len(R))
+    count = min(max(1, chunk // problem.query.shape[1]), len(R))
     used = jnp.sum(jnp.where(jnp.arange(len(problem.weights)) < blocks, jnp.sum(problem.weights, axis=1), 0.0))
 
-    def chunk(j, values):
+    def some(j, values):
         # The last chunk begins early rather than run over the end.
         begin = jnp.minimum(j * count, len(R) - count)
         R_, place_, waypoint_ = (jax.lax.dynamic_slice_in_dim(part, begin, count) for part in (R, place, waypoint))
@@ -393,7 +423,7 @@ def _evaluate(R, place, waypoint, bounds, field, problem, energy):
         return jax.tree.map(lambda whole, part: jax.lax.dynamic_update_slice_in_dim(whole, part, begin, 0), values, total)
 
     values = tuple(jnp.zeros((len(R), *shape), R.dtype) for shape in ((), (6,), (6, 6)))
-    values = jax.lax.fori_loop(0, (last + count - 1) // count, chunk, values)
+    values = jax.lax.fori_loop(0, (last + count - 1) // count, some, values)
     prior = jax.vmap(lambda R, place, target: _prior(R, place, target, field.origin, problem.centre, energy))
     return jax.tree.map(jnp.add, values, prior(R, place, problem.target[waypoint]))
 

@@ -55,7 +55,7 @@ def test_energies_and_gradients_are_those_of_the_energy(field, reference, pose_n
     drawn = solve._candidates(starts, problem)
     R, place = drawn.R.reshape(-1, 3, 3), drawn.place.reshape(-1, 3)
     waypoint = np.tile(np.arange(4), 5)
-    values = solve._evaluate(R, place, waypoint, np.array([20, 20, 3, 0]), field, problem, weights)
+    values = solve._evaluate(R, place, waypoint, np.array([20, 20, 3, 0]), field, problem, weights, 128)
 
     def energy(step, R, place, index):
         R, place = moved(R, place, step)
@@ -105,13 +105,12 @@ def test_a_step_solves_the_damped_system_and_is_bounded():
     np.testing.assert_allclose(cosine, 1, atol=1e-4)
 
 
-def test_chunks_do_not_show(field, reference, monkeypatch):
+def test_chunks_do_not_show(field, reference):
     problem = solve._problem(KEY, reference, 3)
     drawn = solve._candidates(random_starts(KEY, field, reference, 2, "carried", 0.1), problem)
     settings = (drawn.R.reshape(-1, 3, 3), drawn.place.reshape(-1, 3), np.tile(np.arange(4), 2), np.array([8, 8, 3, 0]), field, problem, WEIGHTS)
-    whole = solve._evaluate(*settings)
-    monkeypatch.setattr(solve, "CHUNK_POINTS", 9)  # 3 poses at a time: the last chunk overlaps the one before
-    for part, expected in zip(solve._evaluate(*settings), whole, strict=True):
+    # 3 poses at a time: the last chunk overlaps the one before.
+    for part, expected in zip(solve._evaluate(*settings, 9), solve._evaluate(*settings, 128), strict=True):
         np.testing.assert_allclose(part, expected, rtol=1e-4, atol=1e-6)
 
 
@@ -263,6 +262,7 @@ def test_stages_and_what_is_traced_share_one_program(small_model, field, referen
         ({"steps": (1, 2, 3)}, "steps"),
         ({"steps": (1, 1, 1, 1, 1, 0)}, "steps"),
         ({"finalists": 0}, "finalists"),
+        ({"chunk": 0}, "chunk"),
         ({"tolerance": -0.1}, "tolerance"),
         ({"tolerance": np.nan}, "tolerance"),
         ({"start_radius": np.inf}, "start_radius"),
