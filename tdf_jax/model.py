@@ -95,17 +95,20 @@ def encode(model: Model, points: Float[Array, "points 3"], thinnings: int = THIN
     if not isinstance(thinnings, int | np.integer) or thinnings < 0:
         raise InputError(f"encode(): thinnings is {thinnings}; expected a whole number of 0 or more")
     if not thinnings or count is None or len(points) <= count:
-        return _encode(model.params, model.config, jnp.asarray(points)[None])
+        return _encode(model.params, model.config, jnp.asarray(points)[None], np.ones(1, np.int32))
     if isinstance(points, jax.core.Tracer):
         raise InputError(
             f"encode(): {len(points)} points cannot be thinned to {count} under jax.jit; expected that many. "
             "Thin the cloud outside with tdf.thin, or pass thinnings=0"
         )
-    return _encode(model.params, model.config, jnp.asarray(pointcloud.thinnings(np.asarray(points), count, thinnings)))
+    clouds = pointcloud.thinnings(np.asarray(points), count, thinnings)
+    # A sparse cloud has one thinning: filled up and left out, it runs the program of the others.
+    used = (np.arange(thinnings) < len(clouds)).astype(np.int32)
+    return _encode(model.params, model.config, jnp.asarray(np.resize(clouds, (thinnings, *clouds.shape[1:]))), used)
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _encode(params, config, clouds):
+def _encode(params, config, clouds, used):
     def one(points):
         origin = jnp.mean(points, axis=0)
         # A cloud that was centred in float32 has a mean of about 1e-9 m left. Centring it again in float64 moves the latent by 1e-6
@@ -113,5 +116,10 @@ def _encode(params, config, clouds):
         origin = jnp.where(jnp.max(jnp.abs(origin)) <= CENTRED * jnp.max(jnp.ptp(points, axis=0)), 0.0, origin)
         return encode_latent(params, config, points - origin), origin
 
-    latents, origins = jax.lax.map(one, clouds)
-    return DescriptorField(condition(params, config, jnp.mean(latents, axis=0)), jnp.mean(origins, axis=0))
+    def some(cloud):
+        points, used = cloud
+        nothing = jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), jax.eval_shape(one, points))
+        return jax.lax.cond(used > 0, one, lambda points: nothing, points)
+
+    latent, origin = (jnp.sum(part, axis=0) / jnp.sum(used) for part in jax.lax.map(some, (clouds, used)))
+    return DescriptorField(condition(params, config, latent), origin)
