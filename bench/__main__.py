@@ -91,15 +91,20 @@ def _run(options):
         for row in selected if correct else ():  # what is wrong is not timed
             record["rows"][row.name] = measure(row, workers, state, options.repetitions)
             print(report.line(row.name, record["rows"][row.name]), flush=True)
+            _write(options.out, record)  # as far as it goes: all of it takes half an hour
         if options.scaling and correct:
             from bench import scaling
 
             record["scaling"] = scaling.scaling(workers, state, options.quick, options.repetitions)
             scaling.save(options.out / "scaling.png", record["scaling"])
-    if options.out is not None:
-        replace_file("bench", options.out / "bench.json", (json.dumps(record, indent=1) + "\n").encode())
-        replace_file("bench", options.out / "bench.md", report.markdown(record).encode())
+    _write(options.out, record)
     return _verdict(record, baseline)
+
+
+def _write(folder, record):
+    if folder is not None:
+        replace_file("bench", folder / "bench.json", (json.dumps(record, indent=1) + "\n").encode())
+        replace_file("bench", folder / "bench.md", report.markdown(record).encode())
 
 
 def _verdict(record, baseline):

@@ -17,7 +17,7 @@ def machine() -> dict:
         "cores": cores(),
         "memory_gigabytes": round(_field("/proc/meminfo", "MemTotal") / 1e9, 1),
         "load": round(os.getloadavg()[0], 2),
-        "system": platform.platform(),
+        "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         **{name: _version(name) for name in PACKAGES},
     }
