@@ -70,7 +70,7 @@ def _run(settings: Settings, folder: Path) -> dict:
     save_trajectory(folder / "trajectory.tum", trajectory)
     if not settings.no_plots:
         with _timed(seconds, "plots"):
-            _draw(folder, scene, result)
+            _draw(folder, scene, result, "start" if isinstance(config, OptimizeConfig) else "candidate")
     seconds["total"] = time.perf_counter() - began
     record = report.record(settings, model, scene, energy, config, result, seconds)
     replace_file("tdf imitate", folder / report.RESULT, json.dumps(record, indent=1).encode())
@@ -89,7 +89,7 @@ def _steps(config: SolveConfig | OptimizeConfig) -> int:
     return config.iterations if isinstance(config, OptimizeConfig) else sum(config.steps)
 
 
-def _draw(folder: Path, scene: Scene, result: Result) -> None:
+def _draw(folder: Path, scene: Scene, result: Result, rows: str) -> None:
     from tdf_jax.viz.plots import imitation_figure, loss_figure
     from tdf_jax.viz.style import save_figure
 
@@ -99,7 +99,7 @@ def _draw(folder: Path, scene: Scene, result: Result) -> None:
     figure = imitation_figure(scene.demonstration, scene.points, trajectory, expected, scene.meshes, title)
     save_figure(folder / "imitation.png", figure)
     history = np.column_stack([result.losses, result.energies])
-    save_figure(folder / "loss.png", loss_figure(history, result.best))
+    save_figure(folder / "loss.png", loss_figure(history, result.best, rows=rows))
 
 
 @contextlib.contextmanager

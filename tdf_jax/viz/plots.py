@@ -62,13 +62,14 @@ def imitation_figure(
     return figure
 
 
-def loss_figure(losses: Float[np.ndarray, "inits iterations"], best: int, title: str = "") -> Figure:
+def loss_figure(losses: Float[np.ndarray, "inits iterations"], best: int, title: str = "", rows: str = "start") -> Figure:
     """Loss against iteration of every start, as in figure 5 of the paper.
 
     Args:
         losses: energies; a start that became non-finite ends there.
         best: the start drawn bold.
         title: above.
+        rows: what a row is called; the solver's are candidates.
     """
     losses = np.asarray(losses)
     steps = np.arange(losses.shape[1])
@@ -77,8 +78,8 @@ def loss_figure(losses: Float[np.ndarray, "inits iterations"], best: int, title:
         axes = figure.add_subplot()
         for index, row in enumerate(losses):
             if index != best:
-                axes.plot(steps, row, color=CLOUD, lw=0.7, alpha=0.8, label="other starts")
-        axes.plot(steps, losses[best], color=COLOURS(0.35), lw=2.0, label=f"best, start {best + 1} of {len(losses)}")
+                axes.plot(steps, row, color=CLOUD, lw=0.7, alpha=0.8, label=f"other {rows}s")
+        axes.plot(steps, losses[best], color=COLOURS(0.35), lw=2.0, label=f"best, {rows} {best + 1} of {len(losses)}")
         legend = legend_of(axes)
         axes.legend(legend.values(), legend.keys(), frameon=False)
         axes.set(xlabel="iteration", ylabel="loss (no unit)", title=title, xlim=(0, max(1, steps[-1])))
