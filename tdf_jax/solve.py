@@ -31,9 +31,10 @@ from tdf_jax.demonstration import Reference
 from tdf_jax.energy import EnergyWeights, pose_difference
 from tdf_jax.errors import InputError
 from tdf_jax.field import DescriptorField
+from tdf_jax.keys import check_key
 from tdf_jax.optimize import STARTS, Result, prepare
 
-# Points whose descriptors and 3 tangents exist at a time: 4 MB. A chunk of 512 took 1.5 times as long a point on a CPU with 2 MB of second-level cache a core.
+# Points whose descriptors and 3 tangents exist at a time: 4 MB. With 500 query points a chunk of 512 took twice as long a point on a CPU with 2 MB of second-level cache a core.
 CHUNK_POINTS = 128
 LARGEST_TURN, LARGEST_MOVE = 0.7, 0.05  # radians and metres of one step
 DAMPINGS = 1e-3, 1e3  # least and greatest
@@ -72,8 +73,8 @@ class SolveConfig:
         for name in ("inits", "scouts", "points", "finalists", "chunk"):
             if not _counts(getattr(self, name)) and (name, getattr(self, name)) != ("chunk", None):
                 raise InputError(f"SolveConfig(): {name} is {getattr(self, name)!r}; expected a whole number of at least 1")
-        if len(self.steps) != len(FIRST_DAMPINGS) or not all(map(_counts, self.steps)):
-            raise InputError(f"SolveConfig(): steps is {self.steps!r}; expected six whole numbers of at least 1")
+        if not isinstance(self.steps, tuple) or len(self.steps) != len(FIRST_DAMPINGS) or not all(map(_counts, self.steps)):
+            raise InputError(f"SolveConfig(): steps is {self.steps!r}; expected a tuple of six whole numbers of at least 1")
         if not 0 < self.start_radius < np.inf:
             raise InputError(f"SolveConfig(): start_radius is {self.start_radius}; expected a positive number")
         if not 0 <= self.tolerance < 1:
@@ -150,6 +151,7 @@ def solve(
     Raises:
         InputError: as for `optimize`, or a weight on eq. 6, which couples the waypoints.
     """
+    check_key("solve()", key)
     if np.any(np.asarray(energy.compensator) != 0):
         raise InputError(
             f"solve(): energy.compensator is {energy.compensator}; expected 0, for the solver takes waypoints one by one. Use optimize(), or imitate() with config=OptimizeConfig()"
@@ -395,7 +397,7 @@ def _step(state, damping):
 
 
 def _solved(matrix, right):
-    """Solutions of positive definite systems (poses, 6, 6), by elimination: no pivots are needed, and LAPACK's program takes a second to compile."""
+    """Solutions of positive definite systems (poses, 6, 6), by elimination; no pivots are needed."""
 
     def eliminate(k, system):
         row = system[:, k] / system[:, k, k][:, None]

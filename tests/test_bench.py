@@ -10,6 +10,7 @@ from flax.traverse_util import unflatten_dict
 
 torch = pytest.importorskip("torch")
 
+# After it, for these import torch themselves.
 import tdf_jax as tdf  # noqa: E402
 from bench import __main__ as command_line  # noqa: E402
 from bench import flops, gate, machine, ndf_torch, ours, peer, report, scene  # noqa: E402

@@ -260,6 +260,7 @@ def test_stages_and_what_is_traced_share_one_program(small_model, field, referen
         ({"points": 2.5}, "points"),
         ({"scouts": True}, "scouts"),
         ({"steps": (1, 2, 3)}, "steps"),
+        ({"steps": 5}, "steps"),
         ({"steps": (1, 1, 1, 1, 1, 0)}, "steps"),
         ({"finalists": 0}, "finalists"),
         ({"chunk": 0}, "chunk"),
@@ -283,6 +284,8 @@ def test_what_couples_waypoints_is_refused(field, reference):
     one = dataclasses.replace(reference, descriptors=reference.descriptors[:1], trajectory=tdf.Trajectory(reference.trajectory.wxyz_xyz[:1]))
     with pytest.raises(InputError, match="expected fix_last=False"):
         run(field, one)
+    with pytest.raises(InputError, match=r"solve\(\): key is 0"):
+        run(field, reference, key=0, starts=starts)
     with pytest.raises(InputError, match=r"solve\(\): starts have shape"):
         run(field, reference, starts=starts[0])
 
