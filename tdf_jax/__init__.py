@@ -22,6 +22,7 @@ from tdf_jax.network import NetworkConfig
 from tdf_jax.optimize import OptimizeConfig, Result, optimize
 from tdf_jax.pointcloud import load_points, thin
 from tdf_jax.query import box_query, gaussian_query, gripper_query, lattice_query, snapped_query
+from tdf_jax.refinement import refine
 from tdf_jax.route import lowest_cost_path
 from tdf_jax.shapes import MugParameters, build_mug, sample_mug
 from tdf_jax.solve import SolveConfig, solve

@@ -38,9 +38,9 @@ def imitate(
         demonstration: one, several with the same query points, or a `Reference` from `describe` to share between calls.
         points: the new object's cloud, (points, 3), metres, world frame.
         key: random key, such as `jax.random.key(0)`; the result is a function of it.
-        goal: last pose, T_world_query as `wxyz_xyz`; by default the demonstration's last pose, carried by the centroids.
+        goal: last pose, T_world_query as `wxyz_xyz`; by default, if it is kept, the demonstration's last pose, carried by the centroids.
         goal_offset: world vector added to the goal's translation, metres.
-        fix_last: keep the last pose at the goal.
+        fix_last: keep the last pose at the goal; without, and without a goal, all poses are found alike, such as the one pose of a grasp.
         energy: weights of the terms.
         config: settings of the solver, or, for Adam as in the paper and for energies with eq. 6, of `optimize`.
         progress, mesh: see `solve` and `optimize`.
@@ -54,8 +54,9 @@ def imitate(
     check_key("imitate()", key)
     reference = demonstration if isinstance(demonstration, Reference) else describe(model, demonstration)
     field = encode(model, points)
-    goal = default_goal(field, reference) if goal is None else _finite("goal", goal, (7,))
+    goal = None if goal is None else _finite("goal", goal, (7,))
     if goal_offset is not None:
+        goal = default_goal(field, reference) if goal is None else goal
         goal = goal + jnp.pad(_finite("goal_offset", goal_offset, (3,)), (4, 0))
     minimise = optimize if isinstance(config, OptimizeConfig) else solve
     return minimise(field, reference, key, goal=goal, fix_last=fix_last, energy=energy, config=config, progress=progress, mesh=mesh)

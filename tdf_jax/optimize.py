@@ -148,8 +148,8 @@ def optimize(
         field: the new object's.
         reference: the demonstration's.
         key: random key of the starts.
-        goal: last pose of every start, T_world_query; by default the demonstration's, carried by the centroids.
-        fix_last: keep the last pose at the goal; otherwise it starts there and is free.
+        goal: last pose of every start, T_world_query; by default, if it is kept, the demonstration's, carried by the centroids.
+        fix_last: keep the last pose at the goal; otherwise it is free, and starts at the goal or, without one, at random as the others.
         energy: weights of the terms.
         config: settings.
         starts: use these instead of random ones; their last poses are replaced by the goal only where one is given.
@@ -162,7 +162,7 @@ def optimize(
     Raises:
         InputError: starts, goal or weights of a wrong shape or value, or a reference from another network than the field.
     """
-    starts, energy = prepare("optimize()", field, reference, key, goal, energy, config, starts)
+    starts, energy = prepare("optimize()", field, reference, key, goal, fix_last, energy, config, starts)
     inits, dtype = len(starts), starts.dtype
     count = config.chunk or max(1, devices.points_at_a_time(CHUNK_POINTS) // len(reference.query))
     program = functools.partial(_run, fix_last=fix_last, chunk=count, mesh=mesh)
@@ -191,11 +191,12 @@ def prepare(
     reference: Reference,
     key: PRNGKeyArray,
     goal: Float[Array, "7"] | None,
+    fix_last: bool,
     energy: EnergyWeights,
     config,
     starts: Float[Array, "inits poses 7"] | None,
 ) -> tuple[Float[Array, "inits poses 7"], EnergyWeights]:
-    """Checked starts that end at the goal, and weights of the same type; see `optimize`.
+    """Checked starts, which end at the goal if there is one, and weights of the same type; see `optimize`.
 
     Args:
         function: name for messages.
@@ -212,7 +213,7 @@ def prepare(
         )
     if starts is None:
         check_key(function, key)
-        goal = default_goal(field, reference) if goal is None else goal
+        goal = default_goal(field, reference) if goal is None and fix_last else goal
         starts = random_starts(key, field, reference, config.inits, config.start, config.start_radius)
     if goal is not None:
         _check_goal(function, goal)

@@ -158,7 +158,7 @@ def solve(
         )
     most = dataclasses.replace(config, inits=max(config.inits, config.scouts))
     given = starts is not None
-    starts, energy = prepare("solve()", field, reference, key, goal, energy, most, starts)
+    starts, energy = prepare("solve()", field, reference, key, goal, fix_last, energy, most, starts)
     n = starts.shape[1]
     free = n - 1 if fix_last else n
     if free == 0:

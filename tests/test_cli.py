@@ -504,7 +504,7 @@ def test_an_evaluation_has_a_row_for_every_method_condition_and_set(evaluation, 
         generated = row["set"] == "generated mugs"
         assert row["cases"] == len(row["errors"]) == 2 and row["objects"] == (2 if generated else 1)
         assert [error["object"] for error in row["errors"]] == (["mug 0", "mug 1"] if generated else ["cup", "cup"])
-        assert (row["iou"] is None) == (row["method"] in ("PCA", "ICP"))
+        assert (row["iou"] is None) == (row["iou_refined"] is None) == (row["method"] in ("PCA", "ICP"))
         assert row["position_median_cm"] == pytest.approx(np.median([error["position_cm"] for error in row["errors"]]))
         assert (row["interval_1cm_10deg"] is None) != generated
     assert evaluation["settings"]["meshes"] == str(real) and evaluation["settings"]["seed"] == 3
@@ -519,7 +519,7 @@ def test_a_plain_evaluation_gives_the_same_numbers_and_a_table(evaluation, weigh
     title, heads, units, line = out.splitlines()
     assert title == "generated mugs: 2 objects, 2 transfers; handle, best of 2 starts by loss"
     cells = re.split(r"  +", line)
-    assert cells[:3] == ["small", "full", f"{row['iou']:.3f}"] and cells[-4] == str(row["flips"])
+    assert cells[:4] == ["small", "full", f"{row['iou']:.3f}", f"{row['iou_refined']:.3f}"] and cells[-4] == str(row["flips"])
     low, high = row["interval_2cm_20deg"]
     assert cells[-1] == f"{100 * row['success_2cm_20deg']:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
     ends = {name: heads.index(name) + len(name) for name in ("IoU", "rotation, deg", "flips", "2 cm, 20 deg")}
@@ -532,12 +532,13 @@ def test_a_model_card_tells_what_the_record_does(evaluation):
     assert lines[0] == "# small" and "| trained by | a test |" in lines
     assert "Generated mugs: 2 mugs that no training run saw, 2 transfers." in lines
     assert "`tdf evaluate --seed 3 --pairs 2 --inits 2 --iterations 2 --meshes DIR --poses 2 --clouds full views1 half`" in card
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.count("|") == 10]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.count("|") == 11]
     rows = [row for row in rows if row[0] not in ("cloud", "---")]
     assert len(rows) == len(record["rows"]) == 24
     for cells, row in zip(rows, record["rows"]):
         assert cells[1] == row["method"] and cells[2] == ("n/a" if row["iou"] is None else f"{row['iou']:.3f}")
-        assert cells[3] == f"{row['position_median_cm']:.2f} / {row['position_p90_cm']:.2f} cm"
+        assert cells[3] == ("n/a" if row["iou_refined"] is None else f"{row['iou_refined']:.3f}")
+        assert cells[4] == f"{row['position_median_cm']:.2f} / {row['position_p90_cm']:.2f} cm"
         assert cells[-1].startswith(f"{100 * row['success_2cm_20deg']:.0f} %")
 
 

@@ -191,10 +191,14 @@ def test_the_last_pose_is_fixed_at_the_goal_exactly(field, reference, result):
     np.testing.assert_array_equal(other.starts[:, :-1], result.starts[:, :-1])
 
 
-def test_a_free_last_pose_starts_at_the_goal_and_moves(field, reference):
+def test_a_free_last_pose_starts_at_the_goal_given_or_at_random_and_moves(field, reference):
+    goal = default_goal(field, reference)
+    sent = run(field, reference, goal=goal, fix_last=False)
+    np.testing.assert_array_equal(sent.starts[:, -1], np.tile(goal, (3, 1)))
     free = run(field, reference, fix_last=False)
-    np.testing.assert_array_equal(free.starts[:, -1], np.tile(default_goal(field, reference), (3, 1)))
-    assert np.abs(free.trajectories[:, -1] - free.starts[:, -1]).max(axis=-1).min() > 1e-3
+    np.testing.assert_array_equal(free.starts, random_starts(KEY, field, reference, 3, "carried", 0.1))
+    for result in (sent, free):
+        assert np.abs(result.trajectories[:, -1] - result.starts[:, -1]).max(axis=-1).min() > 1e-3
 
 
 def test_given_starts_are_used_and_may_end_apart(field, reference, energies):

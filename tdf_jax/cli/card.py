@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from tdf_jax.cli.scores import GENERATED, THRESHOLDS, Outcomes, successes
+from tdf_jax.cli.scores import GENERATED, THRESHOLDS, Outcomes, overlap_cells, successes
 from tdf_jax.files import replace_file
 from tdf_jax.model import Model
 from tdf_jax.network import parameter_count
@@ -44,7 +44,7 @@ def card(model: Model, outcomes: Outcomes, settings: dict) -> str:
         first = rows[0][1].summary
         kind = "mugs that no training run saw" if objects == GENERATED else "real mugs, at their own size, none seen in training"
         lines += [f"{objects.capitalize()}: {first['objects']} {kind}, {first['cases']} transfers.", ""]
-        heads = ["cloud", "method", "IoU", "position, median / 90 %", "rotation, median / 90 %", "flips", *THRESHOLDS.values()]
+        heads = ["cloud", "method", "IoU", "refined", "position, median / 90 %", "rotation, median / 90 %", "flips", *THRESHOLDS.values()]
         lines += [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
         lines += [f"| {' | '.join(_cells(clouds, outcome))} |" for clouds, outcome in rows]
         lines += [""]
@@ -74,7 +74,7 @@ def _told(settings: dict) -> str:
 
 def _cells(clouds, outcome) -> list[str]:
     row = outcome.summary
-    cells = [MEANINGS[clouds], outcome.method, "n/a" if row["iou"] is None else f"{row['iou']:.3f}"]
+    cells = [MEANINGS[clouds], outcome.method, *overlap_cells(row)]
     cells.append(f"{row['position_median_cm']:.2f} / {row['position_p90_cm']:.2f} cm")
     cells.append(f"{row['rotation_median_deg']:.1f} / {row['rotation_p90_deg']:.1f}°")
     return [*cells, str(row["flips"]), *successes(row)]

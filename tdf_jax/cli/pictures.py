@@ -10,6 +10,7 @@ from tdf_jax.errors import InputError
 from tdf_jax.evaluation.comparison import Outcome
 from tdf_jax.evaluation.transfer import QUERY_SIZE
 from tdf_jax.model import Model, encode
+from tdf_jax.refinement import refine
 from tdf_jax.viz.style import save_figure
 from tdf_jax.viz.reconstruction import Panel, reconstructed, reconstruction_figure, transfer_figure
 
@@ -41,7 +42,7 @@ def draw(folder: Path, model: Model, outcomes: Outcomes) -> None:
         raise InputError(f"tdf evaluate: cannot make {folder} ({error}); expected a place in an existing folder") from None
     words = f"weights {model.info.name}, cloud {condition}"
     figures = (
-        reconstruction_figure(panels, f"Surfaces of occupancy 0.5: {words}"),
+        reconstruction_figure(panels, f"Surfaces of occupancy 0.5, refined: {words}"),
         transfer_figure(panels, f"The place of a demonstration on other objects: {words}"),
     )
     for name, figure in zip(NAMES, figures):
@@ -49,7 +50,7 @@ def draw(folder: Path, model: Model, outcomes: Outcomes) -> None:
 
 
 def _panel(model: Model, outcome: Outcome, index: int) -> Panel:
-    case, iou = outcome.cases[index], outcome.ious[index]
+    case, iou = outcome.cases[index], outcome.ious["iou_refined"][index]
     T_world_b = case.T_world_b
     T_world_found = np.eye(4)
     T_world_found[:3, :3], T_world_found[:3, 3] = poses.rotation(outcome.found[index]), outcome.found[index][4:]
@@ -58,7 +59,7 @@ def _panel(model: Model, outcome: Outcome, index: int) -> Panel:
         overlap="IoU n/a: not closed" if iou is None else f"IoU {iou:.2f}",
         error=f"{100 * outcome.distance[index]:.1f} cm, {outcome.angle[index]:.0f}° off",
         triangles=np.asarray(case.object_b.mesh.triangles),
-        found=reconstructed(encode(model, case.points_b), T_world_b, case.object_b.mesh.bounds),
+        found=reconstructed(refine(model, encode(model, case.points_b), case.points_b), T_world_b, case.object_b.mesh.bounds),
         T_object_true=np.linalg.inv(T_world_b) @ case.T_world_place_b,
         T_object_found=np.linalg.inv(T_world_b) @ T_world_found,
         size=QUERY_SIZE * case.scale,

@@ -8,6 +8,7 @@ import jax
 
 import tdf_jax
 from tdf_jax.evaluation.comparison import Outcome
+from tdf_jax.evaluation.transfer import OVERLAPS
 from tdf_jax.files import replace_file
 from tdf_jax.model import Model
 
@@ -30,16 +31,21 @@ def table(outcomes: Outcomes, settings: dict) -> str:
     return "\n".join(lines[1:])
 
 
-_HEADS = ["method", "cloud", "IoU", "position, cm", "position, diagonals", "rotation, deg", "flips", *THRESHOLDS.values()]
-_UNITS = ["", "", "", *["median / p90"] * 3, "", *["success (95 %)"] * 3]
+_HEADS = ["method", "cloud", "IoU", "refined", "position, cm", "position, diagonals", "rotation, deg", "flips", *THRESHOLDS.values()]
+_UNITS = ["", "", "", "", *["median / p90"] * 3, "", *["success (95 %)"] * 3]
 
 
 def _cells(clouds: str, outcome: Outcome) -> list[str]:
     row = outcome.summary
-    cells = [outcome.method, clouds, "n/a" if row["iou"] is None else f"{row['iou']:.3f}"]
+    cells = [outcome.method, clouds, *overlap_cells(row)]
     for name, unit, form in (("position", "cm", "5.2f"), ("position", "diagonals", ".3f"), ("rotation", "deg", "5.1f")):
         cells.append(" / ".join(format(row[f"{name}_{kind}_{unit}"], form) for kind in ("median", "p90")))
     return [*cells, str(row["flips"]), *successes(row)]
+
+
+def overlap_cells(row: dict) -> list[str]:
+    """IoU of a summary as encoded and refined."""
+    return ["n/a" if row[name] is None else f"{row[name]:.3f}" for name in OVERLAPS]
 
 
 def successes(row: dict) -> list[str]:
@@ -76,10 +82,10 @@ def record(outcomes: Outcomes, settings: dict, model: Model) -> dict:
 
 
 def _errors(outcome: Outcome) -> list[dict]:
-    several = zip(outcome.cases, outcome.distance, outcome.angle, outcome.ious, strict=True)
+    several = zip(outcome.cases, outcome.distance, outcome.angle, *(outcome.ious[name] for name in OVERLAPS), strict=True)
     return [
-        {"object": case.instance, "position_cm": 100 * float(distance), "rotation_deg": float(angle), "iou": iou}
-        for case, distance, angle, iou in several
+        {"object": case.instance, "position_cm": 100 * float(distance), "rotation_deg": float(angle)} | dict(zip(OVERLAPS, ious))
+        for case, distance, angle, *ious in several
     ]
 
 

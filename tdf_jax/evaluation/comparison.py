@@ -10,7 +10,7 @@ from jaxtyping import Float
 from tdf_jax.evaluation.baselines import aligned
 from tdf_jax.evaluation.cases import Case
 from tdf_jax.evaluation.summary import summary
-from tdf_jax.evaluation.transfer import overlaps, place_errors, transferred
+from tdf_jax.evaluation.transfer import no_overlaps, overlaps, place_errors, transferred
 from tdf_jax.model import Model
 from tdf_jax.network import initialise
 from tdf_jax.optimize import OptimizeConfig
@@ -26,7 +26,7 @@ class Outcome:
         found: poses `wxyz_xyz` of the place, world frame, (cases, 7).
         distance: position errors, metres, (cases,).
         angle: rotation errors, degrees, (cases,).
-        ious: intersections over union; None where there is no volume to compare.
+        ious: see `tdf_jax.evaluation.transfer.overlaps`.
         summary: see `tdf_jax.evaluation.summary`.
     """
 
@@ -35,7 +35,7 @@ class Outcome:
     found: Float[np.ndarray, "cases 7"]
     distance: Float[np.ndarray, "cases"]
     angle: Float[np.ndarray, "cases"]
-    ious: Sequence[float | None]
+    ious: Mapping[str, Sequence[float | None]]
     summary: dict
 
 
@@ -64,7 +64,7 @@ def compare(
         outcomes.append(_outcome(name, cases, found, overlaps(model, cases), seed))
     for method in baselines:
         found = aligned(method, cases, seed=seed, inits=config.inits, progress=progress)
-        outcomes.append(_outcome(method, cases, found, [None] * len(cases), seed))
+        outcomes.append(_outcome(method, cases, found, no_overlaps(cases), seed))
     return outcomes
 
 

@@ -1,6 +1,6 @@
 """What errors over many cases amount to: medians, success rates and how sure they are."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +15,7 @@ RESAMPLES = 2000  # of the bootstrap
 def summary(
     distance: Float[np.ndarray, "cases"],
     angle: Float[np.ndarray, "cases"],
-    ious: Sequence[float | None],
+    ious: Mapping[str, Sequence[float | None]],
     cases: Sequence[Case],
     seed: int = 0,
 ) -> dict:
@@ -26,23 +26,23 @@ def summary(
     Args:
         distance: position errors, metres.
         angle: rotation errors, degrees.
-        ious: None where there is none.
+        ious: by name; None where there is none.
         cases: what the errors are of.
         seed: of the bootstrap.
 
     Returns:
-        Plain numbers by name; None for the IoU where no case has one, and for the intervals of a single object.
+        Plain numbers by name; None for an IoU where no case has one, and for the intervals of a single object.
     """
     share = distance / [case.diagonal for case in cases]
-    known = [iou for iou in ious if iou is not None]
+    known = {name: [iou for iou in several if iou is not None] for name, several in ious.items()}
     names = list(dict.fromkeys(case.instance for case in cases))
     member = np.array([names.index(case.instance) for case in cases])
     drawn = np.random.default_rng(seed).choice(len(names), (RESAMPLES, len(names)))
     row = {
         "cases": len(cases),
         "objects": len(names),
-        "iou": float(np.mean(known)) if known else None,
-        "iou_cases": len(known),
+        **{name: float(np.mean(several)) if several else None for name, several in known.items()},
+        "iou_cases": max(map(len, known.values())),
         "position_median_cm": 100 * float(np.median(distance)),
         "position_p90_cm": 100 * float(np.percentile(distance, 90)),
         "position_median_diagonals": float(np.median(share)),

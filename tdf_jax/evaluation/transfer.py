@@ -15,10 +15,12 @@ from tdf_jax.energy import EnergyWeights
 from tdf_jax.evaluation.cases import Case, Transfer
 from tdf_jax.evaluation.truth import pose_error
 from tdf_jax.model import Model, encode
-from tdf_jax.optimize import OptimizeConfig, optimize, random_starts
+from tdf_jax.optimize import OptimizeConfig, optimize
 from tdf_jax.query import box_query
+from tdf_jax.refinement import refine
 from tdf_jax.trajectory import Trajectory
 
+OVERLAPS = ("iou", "iou_refined")
 QUERIES = 128
 QUERY_SIZE = 0.06  # metres, of the box around the place: the handle and the wall behind it
 
@@ -44,9 +46,7 @@ def transferred(
         reference = place_reference(model, case, box_query(query_key, count=QUERIES, size=QUERY_SIZE * case.scale))
         field = encode(model, case.points_b)
         key = jax.random.fold_in(start_key, index)
-        # Given as they are: drawn inside, every start's last pose, here its only one, would be set to the goal.
-        starts = random_starts(key, field, reference, config.inits, config.start, config.start_radius)
-        result = optimize(field, reference, key, fix_last=False, energy=EnergyWeights(0.0), config=config, starts=starts)
+        result = optimize(field, reference, key, fix_last=False, energy=EnergyWeights(0.0), config=config)
         found.append(result.trajectory.wxyz_xyz[0])
     return np.stack(found)
 
@@ -69,7 +69,7 @@ def place_reference(model: Model, case: Transfer, query: Float[Array, "queries 3
     return Reference(_describe(field, T_world_query, query)[None], shown, query)
 
 
-def overlaps(model: Model, cases: Sequence[Case], samples: int = 20_000, seed: int = 0) -> list[float | None]:
+def overlaps(model: Model, cases: Sequence[Case], samples: int = 20_000, seed: int = 0) -> dict[str, list[float | None]]:
     """Intersection over union of the reconstructed and the true object b, at occupancy 0.5, in every case.
 
     Args:
@@ -79,23 +79,37 @@ def overlaps(model: Model, cases: Sequence[Case], samples: int = 20_000, seed: i
         seed: of the points.
 
     Returns:
-        One number a case; None where object b's mesh is not closed and has no volume.
+        One number a case as the field was encoded, "iou", and one after `refine`, "iou_refined"; None where object b's mesh is not closed and
+        has no volume.
     """
     rng = np.random.default_rng(seed)
-    ious = []
+    ious = no_overlaps([])
     for case in cases:
         low, high = case.object_b.mesh.bounds
         pad = 0.1 * case.diagonal
         x = rng.uniform(low - pad, high + pad, (samples, 3))
         true = case.object_b.contains(x)
         if true is None:
-            ious.append(None)
-            continue
-        field = encode(model, case.points_b)
-        world = (x @ case.T_world_b[:3, :3].T + case.T_world_b[:3, 3]).astype(np.float32)
-        found = np.asarray(_occupancy(field, world)) > 0.5
-        ious.append(float(np.sum(found & true) / np.sum(found | true)))
+            measured = dict.fromkeys(OVERLAPS)
+        else:
+            world = (x @ case.T_world_b[:3, :3].T + case.T_world_b[:3, 3]).astype(np.float32)
+            field = encode(model, case.points_b)
+            measured = {
+                name: _overlap(np.asarray(_occupancy(shape, world)) > 0.5, true)
+                for name, shape in zip(OVERLAPS, (field, refine(model, field, case.points_b)))
+            }
+        for name, iou in measured.items():
+            ious[name].append(iou)
     return ious
+
+
+def no_overlaps(cases: Sequence[Case]) -> dict[str, list[None]]:
+    """What `overlaps` returns of a method that reconstructs nothing."""
+    return {name: [None] * len(cases) for name in OVERLAPS}
+
+
+def _overlap(found, true):
+    return float(np.sum(found & true) / np.sum(found | true))
 
 
 _describe = jax.jit(pose_descriptor)
