@@ -504,7 +504,7 @@ def test_an_evaluation_has_a_row_for_every_method_condition_and_set(evaluation, 
         generated = row["set"] == "generated mugs"
         assert row["cases"] == len(row["errors"]) == 2 and row["objects"] == (2 if generated else 1)
         assert [error["object"] for error in row["errors"]] == (["mug 0", "mug 1"] if generated else ["cup", "cup"])
-        assert (row["iou"] is None) == (row["iou_refined"] is None) == (row["method"] in ("PCA", "ICP"))
+        assert (row["iou"] is None) == (row["iou_refined"] is None) == (row["method"] != "small")
         assert row["position_median_cm"] == pytest.approx(np.median([error["position_cm"] for error in row["errors"]]))
         assert (row["interval_1cm_10deg"] is None) != generated
     assert evaluation["settings"]["meshes"] == str(real) and evaluation["settings"]["seed"] == 3

@@ -14,7 +14,7 @@ from tdf_jax.errors import InputError
 from tdf_jax.evaluation.annotated import AnnotatedMesh
 from tdf_jax.evaluation.cases import mesh_case, mug_case, random_pose
 from tdf_jax.evaluation.clouds import CONDITIONS, NOISE
-from tdf_jax.evaluation.comparison import compare, random_weights
+from tdf_jax.evaluation.comparison import BASELINES, compare, random_weights
 from tdf_jax.evaluation.summary import summary
 from tdf_jax.evaluation.transfer import QUERY_SIZE, overlaps, place_errors, transferred
 from tdf_jax.evaluation.truth import expected_trajectory, path_error, pose_error
@@ -190,11 +190,10 @@ def test_every_case_and_network_runs_the_programs_of_the_first(small_model):
     model = dataclasses.replace(small_model, info=tdf.ModelInfo("small", "a test", cloud_points=40))
     config = tdf.OptimizeConfig(inits=2, iterations=2)
     batches = [[mug_case(0, index, points=60, clouds=clouds)] for index, clouds in enumerate(("full", "half", "views1", "noise"))]
-    compare(batches[0], {"small": model}, ("PCA", "ICP"), config=config, progress=False)
-    other = random_weights(model, 1)
+    compare(batches[0], model, BASELINES, config=config, progress=False)
     with compilations() as names:
         for cases in batches[1:]:
-            compare(cases, {"small": model, "other": other}, ("PCA", "ICP"), config=config, progress=False)
+            compare(cases, model, BASELINES, config=config, progress=False)
     assert names == []
 
 

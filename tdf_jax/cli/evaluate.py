@@ -50,10 +50,9 @@ def evaluate(
     from tdf_jax.checkpoint import load_model
     from tdf_jax.cli import card as cards, scores
     from tdf_jax.evaluation.annotated import load_annotated
-    from tdf_jax.evaluation.baselines import METHODS
     from tdf_jax.evaluation.cases import mesh_case, mug_case
     from tdf_jax.evaluation.clouds import CONDITIONS
-    from tdf_jax.evaluation.comparison import compare, random_weights
+    from tdf_jax.evaluation.comparison import BASELINES, compare
     from tdf_jax.meshes import libigl
     from tdf_jax.optimize import OptimizeConfig
 
@@ -68,7 +67,6 @@ def evaluate(
     }  # fmt: skip
     targets = [] if meshes is None else load_annotated(meshes)
     model = load_model(weights)
-    models = {model.info.name: model} | ({"random weights": random_weights(model, seed)} if baselines else {})
     makers = {
         scores.GENERATED: [functools.partial(mug_case, seed, index, height=height) for index in range(pairs)],
         scores.REAL: [functools.partial(mesh_case, seed, pose, target) for target in targets for pose in range(poses)],
@@ -78,7 +76,7 @@ def evaluate(
         for condition in (CONDITIONS if "all" in clouds else dict.fromkeys(clouds)) if several else ():
             print(f"{objects}, cloud {condition}", file=sys.stderr)
             cases = [make(place=place, clouds=condition) for make in several]
-            outcomes[objects, condition] = compare(cases, models, METHODS if baselines else (), seed=seed, config=config)
+            outcomes[objects, condition] = compare(cases, model, BASELINES if baselines else (), seed=seed, config=config)
             if json is not None:  # as far as it goes: all of it can take hours
                 scores.write(json, scores.record(outcomes, settings, model))
     print(scores.table(outcomes, settings))

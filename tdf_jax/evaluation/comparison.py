@@ -1,4 +1,4 @@
-"""Networks and baselines on the same cases."""
+"""A network and baselines on the same cases."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -7,13 +7,16 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from tdf_jax.evaluation.baselines import aligned
+from tdf_jax.evaluation.baselines import METHODS, aligned
 from tdf_jax.evaluation.cases import Case
 from tdf_jax.evaluation.summary import summary
 from tdf_jax.evaluation.transfer import no_overlaps, overlaps, place_errors, transferred
 from tdf_jax.model import Model
 from tdf_jax.network import initialise
 from tdf_jax.optimize import OptimizeConfig
+
+UNTRAINED = "random weights"
+BASELINES = (UNTRAINED, *METHODS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,29 +44,30 @@ class Outcome:
 
 def compare(
     cases: Sequence[Case],
-    models: Mapping[str, Model],
+    model: Model,
     baselines: Sequence[str] = (),
     *,
     seed: int = 0,
     config: OptimizeConfig = OptimizeConfig(),
     progress: bool = True,
 ) -> list[Outcome]:
-    """Run networks and baselines on cases, each with `config.inits` starts.
+    """Run a network and baselines on cases, each with `config.inits` starts.
 
     Args:
         cases: what to transfer.
-        models: networks by name.
-        baselines: of `tdf_jax.evaluation.baselines.METHODS`; they reconstruct nothing.
+        model: the network.
+        baselines: of `BASELINES`; their reconstructions, if any, are not measured.
         seed: of query points, starts and the bootstrap.
-        config: settings of the networks' optimiser.
+        config: settings of the optimiser.
         progress: show progress bars.
     """
-    outcomes = []
-    for name, model in models.items():
-        found = transferred(model, cases, seed=seed, config=config, progress=progress)
-        outcomes.append(_outcome(name, cases, found, overlaps(model, cases), seed))
+    found = transferred(model, cases, seed=seed, config=config, progress=progress)
+    outcomes = [_outcome(model.info.name, cases, found, overlaps(model, cases), seed)]
     for method in baselines:
-        found = aligned(method, cases, seed=seed, inits=config.inits, progress=progress)
+        if method == UNTRAINED:
+            found = transferred(random_weights(model, seed), cases, seed=seed, config=config, progress=progress)
+        else:
+            found = aligned(method, cases, seed=seed, inits=config.inits, progress=progress)
         outcomes.append(_outcome(method, cases, found, no_overlaps(cases), seed))
     return outcomes
 
