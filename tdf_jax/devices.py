@@ -1,6 +1,7 @@
 """Work shared among the devices of a mesh, in one process or several: each takes a part of the starts, and only results are exchanged."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
@@ -13,6 +14,11 @@ ACCELERATOR_POINTS = 16384
 def points_at_a_time(cpu_points: int) -> int:
     """How many query points to evaluate at a time: a CPU wants them in its cache, an accelerator wants many."""
     return cpu_points if jax.default_backend() == "cpu" else ACCELERATOR_POINTS
+
+
+def alone() -> Mesh:
+    """jax's default device of this process as a mesh."""
+    return Mesh(np.array(list(jnp.zeros(()).devices())), ("alone",))
 
 
 def split(mesh: Mesh) -> PartitionSpec:

@@ -15,8 +15,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import NamedSharding
 from jaxtyping import Array, Float, Int
 
+from tdf_jax import devices
 from tdf_jax.field import DescriptorField
 from tdf_jax.grid import Grid
 
@@ -141,11 +143,12 @@ def swept(
     grid: Grid,
     found: Layers,
     which: Sequence[Tile],
-    devices: Sequence[jax.Device] | None = None,
+    mesh: jax.sharding.Mesh | None = None,
 ) -> Iterator[tuple[Tile, Float[np.ndarray, "poses *tile"]]]:
     """Energies of every waypoint on tiles, in their order.
 
-    As many tiles are computed at a time as there are devices, one on each; no more is held.
+    As many tiles are computed at a time as the mesh has devices, one on each; no more is held. Of several processes each computes those of its
+    own devices, and all of them get all.
 
     Args:
         field: the object's.
@@ -153,7 +156,7 @@ def swept(
         grid: the tiles'.
         found: layers of the query points.
         which: from `tiles`.
-        devices: to share the tiles; jax's default one if not given.
+        mesh: of devices to share the tiles; jax's default one alone if not given.
     """
     dtype = field.origin.dtype
     channels = descriptors.shape[-1]
@@ -164,19 +167,26 @@ def swept(
     references = np.ascontiguousarray(padded.reshape(len(padded), blocks, UNROLLED, -1).swapaxes(0, 1))
     axes = grid.steps[:, None] * grid.directions
     shared = field, references, axes.astype(dtype), found.shifts.astype(np.int32), found.first.astype(np.int32)
-    devices = [None] if devices is None else list(devices)
-    copies = [jax.device_put(shared, device) for device in devices]
+    mesh = devices.alone() if mesh is None else mesh
+    everywhere = NamedSharding(mesh, devices.split(mesh))
+    workers = list(mesh.devices.flat)
+    own = [(index, jax.device_put(shared, worker)) for index, worker in enumerate(workers) if worker.process_index == jax.process_index()]
     scale = descriptors.shape[1] * channels
-    for start in range(0, len(which), len(devices)):
-        running = []
-        for tile, copy, device in zip(which[start:], copies, devices):
+    for start in range(0, len(which), len(workers)):
+        some = which[start : start + len(workers)]
+        parts = []
+        for index, copy in own:
+            # Every device computes something: where the tiles run out, the last one again.
+            tile = some[min(index, len(some) - 1)]
             corner = grid.first + np.asarray(tile.start) @ axes
-            bases = jax.device_put((corner + found.offsets).astype(dtype), device)
+            bases = jax.device_put((corner + found.offsets).astype(dtype), workers[index])
             size = tuple(stop - start for start, stop in zip(*tile))
-            running.append((tile, _tile(*copy, bases, size, found.span)))
-        for tile, sums in running:
+            parts.append(_tile(*copy, bases, size, found.span)[None])
+        shape = (len(workers), *parts[0].shape[1:])
+        together = devices.gathered(jax.make_array_from_single_device_arrays(shape, everywhere, parts))
+        for tile, sums in zip(some, together):
             inside = tuple(slice(part.stop - part.start) for part in tile.within(grid.shape))
-            yield tile, np.asarray(sums)[:, *inside] / scale
+            yield tile, sums[:, *inside] / scale
 
 
 @functools.partial(jax.jit, static_argnames=("size", "span"))

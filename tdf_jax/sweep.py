@@ -1,6 +1,6 @@
 """Sweeping the query frame over a grid, in one orientation or many: from a field and a reference to a landscape (eq. 4 of the TDF paper)."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ def energy_landscape(
     over_rotations: str = "best",
     temperature: float = TEMPERATURE,
     share: bool = True,
-    devices: Sequence[jax.Device] | None = None,
+    mesh: jax.sharding.Mesh | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Landscape:
     """Sweep the query frame over a grid.
@@ -47,14 +47,14 @@ def energy_landscape(
         over_rotations: of several rotations, keep the "best" at every point and for every waypoint, or "each".
         temperature: of the soft least, in units of the energy.
         share: False evaluates every (grid point, query point) by itself, to compare.
-        devices: to share the grid's tiles; jax's default one if not given.
+        mesh: devices to share the grid's tiles, of this process or of several that make the same call; see docs/scaling.md.
         progress: called with the number of tiles done and of all.
 
     Raises:
         InputError: rotations that are none, an unknown choice, or a reference from another network than the field.
     """
     landscape = blank(field, reference, grid, rotation, reduce, over_rotations=over_rotations, temperature=temperature)
-    for done, total in fill(landscape, field, reference, share=share, devices=devices):
+    for done, total in fill(landscape, field, reference, share=share, mesh=mesh):
         if progress is not None:
             progress(done, total)
     return landscape
@@ -101,7 +101,7 @@ def fill(
     done: int = 0,
     *,
     share: bool = True,
-    devices: Sequence[jax.Device] | None = None,
+    mesh: jax.sharding.Mesh | None = None,
 ) -> Iterator[tuple[int, int]]:
     """Sweep a landscape from `blank` in place, tile by tile, so that what is finished can be looked at, kept, and gone on from.
 
@@ -109,13 +109,11 @@ def fill(
         landscape: with the first `done` parts finished.
         field, reference: as it was made with.
         done: parts to leave out, as this function counted them.
-        share, devices: see `energy_landscape`.
+        share, mesh: see `energy_landscape`.
 
     Yields:
         The number of parts done and of all: tiles of the grid, one rotation after the other.
     """
-    if devices is not None and not len(devices):
-        raise InputError("energy_landscape(): devices is empty; expected at least one, or None for the default")
     grid, query = landscape.grid, np.asarray(reference.query, dtype=float)
     found = [lattice.layers(grid, query @ R.T, share) for R in landscape.rotations]
     cover = [lattice.tiles(grid, each.span) for each in found]
@@ -124,7 +122,7 @@ def fill(
     for index, (layers, tiles) in enumerate(zip(found, cover)):
         left = tiles[max(done - before, 0) :]
         before += len(tiles)
-        for tile, values in lattice.swept(field, reference.descriptors, grid, layers, left, devices):
+        for tile, values in lattice.swept(field, reference.descriptors, grid, layers, left, mesh):
             _keep(landscape, index, tile.within(grid.shape), values)
             done += 1
             yield done, total

@@ -1,9 +1,6 @@
-"""Sweeps: equality with the energy of poses one by one, rotations, masks, parts, devices."""
+"""Sweeps: equality with the energy of poses one by one, rotations, masks, parts."""
 
 import dataclasses
-import os
-import subprocess
-import sys
 
 import jax
 import jax.numpy as jnp
@@ -168,41 +165,6 @@ def test_the_change_of_a_query_set_is_told(small_model, demonstration, field, re
     np.testing.assert_allclose(told, (np.median(true), true.max()), rtol=0.05)
 
 
-def test_devices_share_the_tiles(tmp_path):
-    """Eight virtual devices give what one gives."""
-    script = tmp_path / "devices.py"
-    script.write_text(
-        "import sys; sys.path.insert(0, sys.argv[1])\n"
-        "import jax, jax.numpy as jnp, numpy as np\n"
-        "jax.config.update('jax_disable_most_optimizations', True)\n"
-        "import tdf_jax as tdf\n"
-        "from conftest import SMALL, random_cloud\n"
-        "from tdf_jax import lattice\n"
-        "from tdf_jax.network import initialise\n"
-        "lattice.NODES = 60\n"
-        "model = tdf.Model(initialise(jax.random.key(0), SMALL), SMALL, tdf.ModelInfo('small', 'test'))\n"
-        "cloud = jnp.asarray(random_cloud(0), jnp.float32)\n"
-        "path = tdf.line(3, start=(0, 0, 0), end=(0.2, 0, 0))\n"
-        "reference = tdf.describe(model, tdf.Demonstration(cloud, path, tdf.lattice_query((2, 2, 2), 0.02)))\n"
-        "field, grid = tdf.encode(model, cloud + 0.01), tdf.plane_grid(0.2, 21)\n"
-        "assert len(jax.devices()) == 8\n"
-        "seen = set()\n"
-        "kept = lattice._tile\n"
-        "def noted(*arguments):\n"
-        "    found = kept(*arguments)\n"
-        "    seen.update(found.devices())\n"
-        "    return found\n"
-        "one = tdf.energy_landscape(field, reference, grid)\n"
-        "lattice._tile = noted\n"
-        "many = tdf.energy_landscape(field, reference, grid, devices=jax.devices())\n"
-        "np.testing.assert_allclose(many.values, one.values, rtol=1e-5)\n"
-        "assert seen == set(jax.devices()), seen\n"
-    )
-    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=8", "JAX_PLATFORMS": "cpu"}
-    done = subprocess.run([sys.executable, script, os.path.dirname(__file__)], env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
 def test_what_does_not_fit_is_refused(field, reference):
     grid = plane_grid(0.2, 3)
     with pytest.raises(InputError, match=r"rotation has shape \(7,\)"):
@@ -210,8 +172,6 @@ def test_what_does_not_fit_is_refused(field, reference):
     for matrix in (2 * np.eye(3), np.diag([1.0, 1.0, -1.0])):
         with pytest.raises(InputError, match="no rotations"):
             energy_landscape(field, reference, grid, matrix)
-    with pytest.raises(InputError, match="devices is empty"):
-        energy_landscape(field, reference, grid, devices=[])
     with pytest.raises(InputError, match="over_rotations is 'all'"):
         energy_landscape(field, reference, grid, over_rotations="all")
     with pytest.raises(InputError, match="reduce is 'min'"):
