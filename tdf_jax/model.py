@@ -16,6 +16,7 @@ from tdf_jax.network import NetworkConfig, condition, encode_latent
 from tdf_jax.pointcloud import check_points
 
 CENTRED = 1e-7  # of a cloud's extent: a mean this near zero is float32's rounding
+ROOM = 250  # clouds that are not thinned are filled up to a multiple, which common sizes are already
 THINNINGS = 8  # 16 gain another 0.003 of IoU
 
 
@@ -94,32 +95,38 @@ def encode(model: Model, points: Float[Array, "points 3"], thinnings: int = THIN
     points, count = check_points(points), model.info.cloud_points
     if not isinstance(thinnings, int | np.integer) or thinnings < 0:
         raise InputError(f"encode(): thinnings is {thinnings}; expected a whole number of 0 or more")
-    if not thinnings or count is None or len(points) <= count:
-        return _encode(model.params, model.config, jnp.asarray(points)[None], np.ones(1, np.int32))
+    plain = not thinnings or count is None
+    dense = not plain and len(points) > count
     if isinstance(points, jax.core.Tracer):
-        raise InputError(
-            f"encode(): {len(points)} points cannot be thinned to {count} under jax.jit; expected that many. "
-            "Thin the cloud outside with tdf.thin, or pass thinnings=0"
-        )
-    clouds = pointcloud.thinnings(np.asarray(points), count, thinnings)
-    # A sparse cloud has one thinning: filled up and left out, it runs the program of the others.
-    used = (np.arange(thinnings) < len(clouds)).astype(np.int32)
-    return _encode(model.params, model.config, jnp.asarray(np.resize(clouds, (thinnings, *clouds.shape[1:]))), used)
+        if dense:
+            raise InputError(
+                f"encode(): {len(points)} points cannot be thinned to {count} under jax.jit; expected that many. "
+                "Thin the cloud outside with tdf.thin, or pass thinnings=0"
+            )
+        return _encode(model.params, model.config, points[None], 1, len(points))
+    clouds = pointcloud.thinnings(np.asarray(points), count, thinnings) if dense else np.asarray(points)[None]
+    several, size = clouds.shape[:2]
+    # Filled up with clouds and points that do not count: clouds of many sizes run one program.
+    room = (1, -(-size // ROOM) * ROOM) if plain else (thinnings, count)
+    return _encode(model.params, model.config, np.resize(clouds, (*room, 3)), np.int32(several), np.int32(size))
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _encode(params, config, clouds, used):
+def _encode(params, config, clouds, several, size):
+    """The field of the first `several` clouds, averaged, of each of which the first `size` points count; the others are repetitions."""
+    used = jnp.arange(clouds.shape[1]) < size
+
     def one(points):
-        origin = jnp.mean(points, axis=0)
+        origin = jnp.mean(points, axis=0, where=used[:, None])
         # A cloud that was centred in float32 has a mean of about 1e-9 m left. Centring it again in float64 moves the latent by 1e-6
         # of its length, so it counts as centred: parity with the original, which leaves centring to the caller, is then exact.
         origin = jnp.where(jnp.max(jnp.abs(origin)) <= CENTRED * jnp.max(jnp.ptp(points, axis=0)), 0.0, origin)
-        return encode_latent(params, config, points - origin), origin
+        return encode_latent(params, config, points - origin, used), origin
 
-    def some(cloud):
-        points, used = cloud
+    def some(numbered):
+        index, points = numbered
         nothing = jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), jax.eval_shape(one, points))
-        return jax.lax.cond(used > 0, one, lambda points: nothing, points)
+        return jax.lax.cond(index < several, one, lambda points: nothing, points)
 
-    latent, origin = (jnp.sum(part, axis=0) / jnp.sum(used) for part in jax.lax.map(some, (clouds, used)))
+    latent, origin = (jnp.sum(part, axis=0) / several for part in jax.lax.map(some, (jnp.arange(len(clouds)), clouds)))
     return DescriptorField(condition(params, config, latent), origin)

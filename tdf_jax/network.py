@@ -21,7 +21,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from flax.traverse_util import flatten_dict
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 Vectors = tuple[Float[Array, "points channels"], Float[Array, "points channels"], Float[Array, "points channels"]]
 
@@ -142,13 +142,13 @@ class EdgeConvolution(nn.Module):
         self.map_to_feat = VectorMap(3, self.channels)
         self.map_to_dir = VectorMap(3, self.channels)
 
-    def __call__(self, points: Float[Array, "points 3"]) -> Vectors:
+    def __call__(self, points: Float[Array, "points 3"], used: Bool[Array, "points"] | None = None) -> Vectors:
         kernels = self.map_to_feat.kernel, self.map_to_dir.kernel
         # Promoted first: products of float32 kernels would round away what float64 points ask for.
         feature, direction = (kernel.astype(jnp.promote_types(kernel.dtype, points.dtype)) for kernel in kernels)
         own = tuple(points.T)  # planes (points,)
         spread = _map(lambda plane: plane[:, None], own)
-        neighbours = points[nearest_neighbours(points, self.neighbours)]
+        neighbours = points[nearest_neighbours(points, self.neighbours, used)]
         edge = _map(lambda a, x: a - x, tuple(jnp.moveaxis(neighbours, -1, 0)), spread)  # planes (points, neighbours)
         cross = _cross(edge, spread)
         square = jnp.broadcast_to(_dot(spread, spread), edge[0].shape)
@@ -173,13 +173,14 @@ def _bilinear(a, b):
     return jnp.stack([a[0] * b[0], a[0] * b[1] + a[1] * b[0], a[1] * b[1], a[2] * b[2]])
 
 
-def nearest_neighbours(points: Float[Array, "points 3"], count: int):
-    """Indices (points, count) of the nearest points by Euclidean distance, the point itself included."""
+def nearest_neighbours(points: Float[Array, "points 3"], count: int, used: Bool[Array, "points"] | None = None):
+    """Indices (points, count) of the nearest points, or of those used, by Euclidean distance, the point itself included."""
     points = jax.lax.stop_gradient(points)
 
     def nearest(x):
         # Differences, not |a|^2 + |b|^2 - 2ab: in float32 the latter misorders near neighbours of a cloud far from zero.
         squared = sum((points[:, axis] - x[axis]) ** 2 for axis in range(3))
+        squared = squared if used is None else jnp.where(used, squared, jnp.inf)
         return jax.lax.top_k(-squared, count)[1]
 
     # In blocks, for all distances of a dense cloud do not fit: 6 GB at 40,000 points.
@@ -235,11 +236,12 @@ class Encoder(nn.Module):
         self.actvn_c = VectorLeakyReLU(hidden, config.slope)
         self.fc_c = VectorLinear(hidden, config.latent)
 
-    def __call__(self, points: Float[Array, "points 3"]) -> Float[Array, "latent 3"]:
-        x, pooled = self.fc_pos(self.conv_pos(points * self.config.scaling)), None
+    def __call__(self, points: Float[Array, "points 3"], used: Bool[Array, "points"] | None = None) -> Float[Array, "latent 3"]:
+        where = None if used is None else used[:, None]
+        x, pooled = self.fc_pos(self.conv_pos(points * self.config.scaling, used)), None
         for index in range(self.config.blocks):
             x = getattr(self, f"block_{index}")(x, pooled)
-            pooled = _map(lambda plane: jnp.mean(plane, axis=0, keepdims=True), x)
+            pooled = _map(lambda plane: jnp.mean(plane, axis=0, keepdims=True, where=where), x)
         return jnp.concatenate(self.fc_c(self.actvn_c(pooled))).T
 
 
@@ -333,16 +335,18 @@ class OccupancyNetwork(nn.Module):
         """Args: points, centred, in metres."""
         return self.decoder(self.encoder(points))
 
-    def encode_latent(self, points: Float[Array, "points 3"]) -> Float[Array, "latent 3"]:
-        return self.encoder(points)
+    def encode_latent(self, points: Float[Array, "points 3"], used: Bool[Array, "points"] | None = None) -> Float[Array, "latent 3"]:
+        return self.encoder(points, used)
 
     def condition(self, latent: Float[Array, "latent 3"]) -> Conditioned:
         return self.decoder(latent)
 
 
-def encode_latent(params, config: NetworkConfig, points: Float[Array, "points 3"]) -> Float[Array, "latent 3"]:
-    """The latent z of a cloud centred on its mean, in metres."""
-    return OccupancyNetwork(config).apply({"params": params}, points, method="encode_latent")
+def encode_latent(
+    params, config: NetworkConfig, points: Float[Array, "points 3"], used: Bool[Array, "points"] | None = None
+) -> Float[Array, "latent 3"]:
+    """The latent z of a cloud centred on its mean, in metres; of a part of its points where `used` says which."""
+    return OccupancyNetwork(config).apply({"params": params}, points, used, method="encode_latent")
 
 
 def condition(params, config: NetworkConfig, latent: Float[Array, "latent 3"]) -> Conditioned:

@@ -75,7 +75,9 @@ def test_dense_clouds_are_thinned_to_the_networks_density(small_model, reference
     dense = np.concatenate([TARGET, TARGET + np.float32(1e-3)])
     model = dataclasses.replace(small_model, info=tdf.ModelInfo("small", "random numbers", cloud_points=40))
     found = tdf.imitate(model, reference, dense, key=KEY, config=CONFIG)
-    assert_equal(found, tdf.imitate(small_model, reference, thin(dense, 40), key=KEY, config=CONFIG))
+    expected = tdf.imitate(small_model, reference, thin(dense, 40), key=KEY, config=CONFIG)
+    np.testing.assert_allclose(found.energies, expected.energies, rtol=1e-4)
+    np.testing.assert_allclose(found.trajectories, expected.trajectories, atol=1e-4)
 
 
 def test_a_batch_is_every_target_with_a_key_of_its_own(small_model, imitate, demonstration, reference, result):
