@@ -10,6 +10,8 @@ WHOLE = PartitionSpec()
 # Descriptors held at a time on an accelerator: 134 MB, and as much again for every tangent. An estimate: enough to fill it, few enough for its memory.
 ACCELERATOR_POINTS = 16384
 
+ONCE = {"xla_backend_optimization_level": 0}  # for programs that run once a call: half the time to compile
+
 
 def points_at_a_time(cpu_points: int) -> int:
     """How many query points to evaluate at a time: a CPU wants them in its cache, an accelerator wants many."""

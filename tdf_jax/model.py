@@ -103,7 +103,9 @@ def encode(model: Model, points: Float[Array, "points 3"], thinnings: int = THIN
                 f"encode(): {len(points)} points cannot be thinned to {count} under jax.jit; expected that many. "
                 "Thin the cloud outside with tdf.thin, or pass thinnings=0"
             )
-        return _encode(model.params, model.config, points[None], 1, len(points))
+        # Not by the loop below, which has no reverse-mode derivative.
+        latent, origin = _latent(model.params, model.config, points)
+        return DescriptorField(condition(model.params, model.config, latent), origin)
     clouds = pointcloud.thinnings(np.asarray(points), count, thinnings) if dense else np.asarray(points)[None]
     several, size = clouds.shape[:2]
     # Filled up with clouds and points that do not count: clouds of many sizes run one program.
@@ -116,17 +118,19 @@ def _encode(params, config, clouds, several, size):
     """The field of the first `several` clouds, averaged, of each of which the first `size` points count; the others are repetitions."""
     used = jnp.arange(clouds.shape[1]) < size
 
-    def one(points):
-        origin = jnp.mean(points, axis=0, where=used[:, None])
-        # A cloud that was centred in float32 has a mean of about 1e-9 m left. Centring it again in float64 moves the latent by 1e-6
-        # of its length, so it counts as centred: parity with the original, which leaves centring to the caller, is then exact.
-        origin = jnp.where(jnp.max(jnp.abs(origin)) <= CENTRED * jnp.max(jnp.ptp(points, axis=0)), 0.0, origin)
-        return encode_latent(params, config, points - origin, used), origin
+    def add(index, sums):
+        return jax.tree.map(jnp.add, sums, _latent(params, config, clouds[index], used))
 
-    def some(numbered):
-        index, points = numbered
-        nothing = jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), jax.eval_shape(one, points))
-        return jax.lax.cond(index < several, one, lambda points: nothing, points)
-
-    latent, origin = (jnp.sum(part, axis=0) / several for part in jax.lax.map(some, (jnp.arange(len(clouds)), clouds)))
+    dtype = jnp.result_type(clouds, *jax.tree.leaves(params))
+    sums = jnp.zeros((config.latent, 3), dtype), jnp.zeros(3, clouds.dtype)
+    latent, origin = (part / several for part in jax.lax.fori_loop(0, several, add, sums))
     return DescriptorField(condition(params, config, latent), origin)
+
+
+def _latent(params, config, points, used=None):
+    """Latent and origin of a cloud, or of the part of it that is used."""
+    origin = jnp.mean(points, axis=0, where=None if used is None else used[:, None])
+    # A cloud that was centred in float32 has a mean of about 1e-9 m left. Centring it again in float64 moves the latent by 1e-6
+    # of its length, so it counts as centred: parity with the original, which leaves centring to the caller, is then exact.
+    origin = jnp.where(jnp.max(jnp.abs(origin)) <= CENTRED * jnp.max(jnp.ptp(points, axis=0)), 0.0, origin)
+    return encode_latent(params, config, points - origin, used), origin

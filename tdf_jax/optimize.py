@@ -164,6 +164,7 @@ def optimize(
     """
     starts, energy = prepare("optimize()", field, reference, key, goal, fix_last, energy, config, starts)
     inits, dtype = len(starts), starts.dtype
+    starts = jnp.asarray(starts)
     count = config.chunk or max(1, devices.points_at_a_time(CHUNK_POINTS) // len(reference.query))
     program = functools.partial(_run, fix_last=fix_last, chunk=count, mesh=mesh)
     rates = np.array([config.rotation_rate, config.translation_rate, config.final_rate, config.iterations], dtype)
@@ -195,7 +196,7 @@ def prepare(
     energy: EnergyWeights,
     config,
     starts: Float[Array, "inits poses 7"] | None,
-) -> tuple[Float[Array, "inits poses 7"], EnergyWeights]:
+) -> tuple[Float[np.ndarray, "inits poses 7"], EnergyWeights]:
     """Checked starts, which end at the goal if there is one, and weights of the same type; see `optimize`.
 
     Args:
@@ -217,7 +218,7 @@ def prepare(
         starts = random_starts(key, field, reference, config.inits, config.start, config.start_radius)
     if goal is not None:
         _check_goal(function, goal)
-    starts = jnp.asarray(starts)
+    starts = np.asarray(starts)
     if starts.ndim != 3 or starts.shape[1:] != (reference.trajectory.poses, 7):
         raise InputError(
             f"{function}: starts have shape {starts.shape}; expected (inits, {reference.trajectory.poses}, 7), "
@@ -227,9 +228,10 @@ def prepare(
     dtype = jnp.result_type(starts, reference.query, reference.descriptors, field.latent)
     _check_weights(function, energy)
     energy = jax.tree.map(lambda weight: jnp.asarray(weight, dtype), energy)
-    starts = starts.astype(dtype)
-    starts = starts if goal is None else starts.at[:, -1].set(jnp.asarray(goal, dtype))
-    check_trajectory(Trajectory(np.reshape(starts, (-1, 7))), "starts")
+    starts = np.array(starts, dtype)
+    if goal is not None:
+        starts[:, -1] = goal
+    check_trajectory(Trajectory(starts.reshape(-1, 7)), "starts")
     return starts, energy
 
 
@@ -262,7 +264,7 @@ def random_starts(
     return _random_starts(key, field.origin, reference, radius, inits=inits, start=start)
 
 
-@functools.partial(jax.jit, static_argnames=("inits", "start"))
+@functools.partial(jax.jit, static_argnames=("inits", "start"), compiler_options=devices.ONCE)
 def _random_starts(key, origin, reference, radius, *, inits, start):
     return jax.vmap(lambda m: _start(jax.random.fold_in(key, m), origin, reference, start, radius))(jnp.arange(inits))
 

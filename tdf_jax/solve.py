@@ -11,9 +11,6 @@ runs on a few of the query points; only the last stage sees all of them:
 4. carry: the demonstration as the keyframe's finalists, the best pose of each waypoint, or the centroids alone carry it, few points;
 5. refine: the best distinct candidates of each waypoint, few points;
 6. polish: the same, all query points.
-
-A step solves (H + damping diag(H)) delta = -gradient for each pose. The gradient is the energy's own; H is that of the absolute values
-replaced by r^2 / (2 max(|r|, s)), with s the mean |r| of the query point: iteratively reweighted least squares, made less steep near zero.
 """
 
 import dataclasses
@@ -26,9 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from tdf_jax import devices, poses
+from tdf_jax import descent, devices, poses
 from tdf_jax.demonstration import Reference
-from tdf_jax.energy import EnergyWeights, pose_difference
+from tdf_jax.energy import EnergyWeights
 from tdf_jax.errors import InputError
 from tdf_jax.field import DescriptorField
 from tdf_jax.keys import check_key
@@ -36,11 +33,7 @@ from tdf_jax.optimize import STARTS, Result, prepare
 
 # Points whose descriptors and 3 tangents exist at a time: 4 MB. With 500 query points a chunk of 512 took twice as long a point on a CPU with 2 MB of second-level cache a core.
 CHUNK_POINTS = 128
-LARGEST_TURN, LARGEST_MOVE = 0.7, 0.05  # radians and metres of one step
-DAMPINGS = 1e-3, 1e3  # least and greatest
-ACCEPTED, REJECTED = 0.3, 4.0  # factors on the damping
 FIRST_DAMPINGS = 1.0, 0.3, 1.0, 0.3, 0.1, 0.03  # of the six stages
-LEAST_DIFFERENCE = 1e-4  # metres; the curvature of eq. 3's norm grows without bound towards zero: that of no smaller difference is taken
 SAME_ANGLE, SAME_DISTANCE = np.radians(10), 0.01  # radians and metres within which two candidates count as one
 
 
@@ -85,24 +78,6 @@ class SolveConfig:
 
 def _counts(value):
     return isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= 1
-
-
-class Problem(NamedTuple):
-    """What poses are to match, with the query points in blocks: a stage sees the first, or all.
-
-    Attributes:
-        query: relative to their mean, (blocks, size, 3), metres.
-        weights: 1, or 0 for what fills up the last block, (blocks, size).
-        descriptors: the demonstration's.
-        target: waypoints of the reference, `wxyz_xyz`, relative to the object's origin.
-        centre: mean of the query points, in the query frame.
-    """
-
-    query: Float[Array, "blocks size 3"]
-    weights: Float[Array, "blocks size"]
-    descriptors: Float[Array, "waypoints blocks size channels"]
-    target: Float[Array, "waypoints 7"]
-    centre: Float[Array, "3"]
 
 
 class Candidates(NamedTuple):
@@ -163,12 +138,14 @@ def solve(
     free = n - 1 if fix_last else n
     if free == 0:
         raise InputError("solve(): the trajectory has one pose and fix_last keeps it; expected fix_last=False")
-    ends = np.asarray(starts[:, free:])
-    if not (ends == ends[:1]).all():
+    if not (starts[:, free:] == starts[:1, free:]).all():
         raise InputError("solve(): the last poses of the starts differ and fix_last keeps them; expected one, or a goal")
 
     problem = _problem(key, reference, min(config.points, len(reference.query)))
-    drawn = _candidates(starts, problem)
+    # Together, and on the host: programs for each would take longer to compile than the search takes.
+    together = _candidates(np.concatenate([*np.asarray(starts), problem.target]), problem)
+    drawn = Candidates(*(part[:-n].reshape(len(starts), n, *part.shape[1:]) for part in together[:2]))
+    shown = Candidates(*(part[-n:] for part in together[:2]))
     scouts, inits, kept = (len(starts),) * 2 + (config.finalists,) if given else (config.scouts, config.inits, config.finalists)
     room = max(scouts, max(inits, free + kept + 1) * free + 1)
     shared, parts = (field, problem, energy), 1
@@ -187,7 +164,7 @@ def solve(
         rows = np.concatenate([found.history, *(np.broadcast_to(other, (len(found.history), *other.shape)) for other in others)], axis=1)
         return np.sort(rows, axis=1)[:, np.minimum(np.arange(kept), rows.shape[1] - 1)].sum(axis=2)
 
-    keyframe = int(np.linalg.norm(_candidates(problem.target, problem).place[:free], axis=1).argmin())
+    keyframe = int(np.linalg.norm(shown.place[:free], axis=1).argmin())
     alone = [keyframe]
     found, _ = stage(0, Candidates(drawn.R[:scouts, alone], drawn.place[:scouts, alone]), waypoints=alone)
     curves = [curve(found)]
@@ -197,7 +174,7 @@ def solve(
         picked = _distinct(found, kept)
         found, _ = stage(2, Candidates(drawn.R[:inits, :free], drawn.place[:inits, :free]))
         curves = [curve(found)]
-        carried, _ = stage(3, _carried(found, picked, keyframe, problem, field.origin))
+        carried, _ = stage(3, _carried(found, picked, keyframe, shown, field.origin))
         curves.append(curve(carried, found.energy))
         found = Candidates(*(np.concatenate(pair) for pair in zip(found[:3], carried[:3])))
     found, _ = stage(4, _distinct(found, kept))
@@ -210,30 +187,20 @@ def solve(
     begun = Candidates(*(np.take_along_axis(part, _like(order, part), axis=0) for part in begun[:2]))
     curves.append(np.take_along_axis(found.history, order[None], axis=1).sum(axis=2))
     losses = (np.concatenate([*(stage[:-1] for stage in curves[:-1]), curves[-1]]) + fixed) / n
-    trajectories, begun = (
-        jnp.concatenate([_poses(part, problem), jnp.broadcast_to(starts[:1, free:], (len(order), n - free, 7))], axis=1)
-        for part in (rows, begun)
-    )
-    losses = jnp.asarray(losses.T, starts.dtype)
-    return Result(trajectories, losses[:, :-1], losses[:, -1], begun)
+    both = _poses(Candidates(*(np.stack(pair) for pair in zip(rows[:2], begun[:2]))), problem)
+    ends = np.broadcast_to(starts[:1, free:], (*both.shape[:2], n - free, 7))
+    trajectories, begun = np.concatenate([both, ends], axis=2)
+    losses = losses.T.astype(starts.dtype)
+    return Result(*map(jnp.asarray, (trajectories, losses[:, :-1], losses[:, -1], begun)))
 
 
 def _problem(key, reference, size):
     count = len(reference.query)
-    blocks = -(-count // size)
     # A stream of its own: start m is drawn from fold_in(key, m).
-    seed = np.asarray(jax.random.key_data(key)).ravel()
-    # What fills up the last block is any point, with weight 0.
-    order = np.resize(np.random.default_rng(seed).permutation(count), blocks * size)
-    query, descriptors = reference.query, reference.descriptors
-    centre = jnp.mean(query, axis=0)
-    return Problem(
-        query=(query - centre)[order].reshape(blocks, size, 3),
-        weights=jnp.asarray((np.arange(blocks * size) < count).reshape(blocks, size), query.dtype),
-        descriptors=descriptors[:, order].reshape(len(descriptors), blocks, size, -1),
-        target=reference.trajectory.wxyz_xyz,
-        centre=centre,
-    )
+    shuffled = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel()).permutation(count)
+    blocks = -(-count // size), size
+    # What fills up the last block is any point, and does not count.
+    return descent.problem(reference, np.resize(shuffled, blocks), (np.arange(np.prod(blocks)) < count).reshape(blocks))
 
 
 def _candidates(wxyz_xyz, problem):
@@ -242,17 +209,16 @@ def _candidates(wxyz_xyz, problem):
 
 
 def _poses(candidates, problem):
-    return poses.pose(jnp.asarray(candidates.R), jnp.asarray(candidates.place - candidates.R @ np.asarray(problem.centre)))
+    return np.asarray(poses.pose(candidates.R, candidates.place - candidates.R @ np.asarray(problem.centre)))
 
 
 def _like(order, part):
     return order.reshape(order.shape + (1,) * (part.ndim - 2))
 
 
-def _carried(found, picked, keyframe, problem, origin):
+def _carried(found, picked, keyframe, shown, origin):
     """The demonstration as the best pose of each waypoint, the keyframe's finalists and the centroids alone carry it, rigidly."""
     free = found.R.shape[1]
-    shown = _candidates(problem.target, problem)
     R_shown, place_shown = shown.R[:free], shown.place[:free] + np.asarray(origin)
     best = found.energy.argmin(axis=0), np.arange(free)
     # Where which waypoint comes to; the centroids leave it where it is.
@@ -305,174 +271,10 @@ def _run(stage, candidates, fixed=None, waypoints=None, *, shared, config, room,
         given = devices.placed([part[dealt] for part in given], mesh, devices.split(mesh))
         limits = devices.placed(limits, mesh)
     chunk = config.chunk or devices.points_at_a_time(CHUNK_POINTS)
-    results = _descend(*given, *limits, *shared, length=max(config.steps) + 1, chunk=chunk, mesh=mesh)
+    results = descent.descend(*given, *limits, *shared, length=max(config.steps) + 1, chunk=chunk, mesh=mesh)
     R, place, values = (devices.gathered(part)[np.argsort(dealt)] if mesh is not None else np.asarray(part) for part in results)
     history = values.T[: config.steps[stage] + 1]
     history = np.where(np.isfinite(history), history, np.inf)
     ended = [part[: rows * free].reshape(rows, free, *part.shape[1:]) for part in (R, place)]
     energies = history[:, : rows * free].reshape(len(history), rows, free)
     return Candidates(*ended, energies[-1], energies), history[-1, rows * free : count].sum()
-
-
-class _State(NamedTuple):
-    """Poses, each apart from the others, with its energy and the quadratic model of it.
-
-    `gradient` and `hessian` are with respect to a turn about the query points' mean (on the left) and a move.
-    """
-
-    R: Float[Array, "poses 3 3"]
-    place: Float[Array, "poses 3"]
-    energy: Float[Array, "poses"]
-    gradient: Float[Array, "poses 6"]
-    hessian: Float[Array, "poses 6 6"]
-
-
-@functools.partial(jax.jit, static_argnames=("length", "chunk", "mesh"))
-def _descend(R, place, waypoint, bounds, damping, tolerance, field, problem, energy, *, length, chunk, mesh=None):
-    """Damped Gauss-Newton steps, until none promises to gain by the tolerance.
-
-    Args:
-        R, place: poses, see `Candidates`.
-        waypoint: of each pose, what it is to match.
-        bounds: how many of the poses move, how many are evaluated, blocks of query points, most steps.
-        damping: of the first step.
-        tolerance: see `SolveConfig`.
-        field, problem, energy: what is minimised.
-        length: times a history has room for.
-        chunk: query points evaluated at a time.
-        mesh: devices that the poses are dealt out to in turns.
-
-    Returns:
-        R, place, and energies at the start and after each step, (poses, length); those of steps that were not taken are the latest.
-    """
-    work = functools.partial(_steps, length=length, chunk=chunk, axes=mesh.axis_names if mesh is not None else ())
-    if mesh is not None:
-        split = devices.split(mesh)
-        work = jax.shard_map(work, mesh=mesh, in_specs=(*[split] * 3, *[devices.WHOLE] * 6), out_specs=split, check_vma=False)
-    return work(R, place, waypoint, bounds, damping, tolerance, field, problem, energy)
-
-
-def _steps(R, place, waypoint, bounds, damping, tolerance, field, problem, energy, *, length, chunk, axes):
-    """`_descend` on one device; `axes` are the mesh's."""
-    if axes:
-        parts, part = jax.lax.axis_size(axes), jax.lax.axis_index(axes)
-        bounds = bounds.at[:2].set((bounds[:2] - part + parts - 1) // parts)  # of the poses dealt out, those of this device
-    moving, _, _, steps = bounds
-    moves = jnp.arange(len(R)) < moving
-
-    def body(carry):
-        i, state, damping, step, _, history = carry
-        R, place = poses.exp(step[:, :3]) @ state.R, state.place + step[:, 3:]
-        trial = _State(R, place, *_evaluate(R, place, waypoint, bounds, field, problem, energy, chunk))
-        # The first time nothing has moved and the state's energies are infinite: it takes what is finite.
-        better = trial.energy < state.energy
-        state = jax.tree.map(lambda a, b: jnp.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b), trial, state)
-        factor = jnp.where(i == 0, 1.0, jnp.where(better, ACCEPTED, REJECTED))
-        damping = jnp.clip(damping * factor, *DAMPINGS)
-        step, promise = _step(state, damping)
-        hopeful = jnp.any(moves & (promise > tolerance * state.energy))
-        hopeful = jax.lax.pmax(hopeful.astype(jnp.int32), axes) > 0 if axes else hopeful
-        history = jnp.where(jnp.arange(length) >= i, state.energy[:, None], history)
-        return i + 1, state, damping, jnp.where(moves[:, None], step, 0.0), hopeful, history
-
-    count, dtype = len(R), R.dtype
-    values = jnp.full(count, jnp.inf, dtype), jnp.zeros((count, 6), dtype), jnp.broadcast_to(jnp.eye(6, dtype=dtype), (count, 6, 6))
-    begin = _State(R, place, *values), jnp.full(count, damping, dtype), jnp.zeros((count, 6), dtype)
-    carry = (jnp.int32(0), *begin, jnp.bool_(True), jnp.zeros((count, length), dtype))
-    _, state, _, _, _, history = jax.lax.while_loop(lambda carry: (carry[0] <= steps) & carry[4], body, carry)
-    return state.R, state.place, history
-
-
-def _step(state, damping):
-    """The next step of every pose, (poses, 6), and by how much its quadratic model falls."""
-    diagonal = jnp.diagonal(state.hessian, axis1=1, axis2=2)
-    # Far from the object a field is flat: the floor keeps the system solvable.
-    damped = state.hessian + (damping[:, None] * diagonal + 1e-9)[:, :, None] * jnp.eye(6, dtype=diagonal.dtype)
-    step = -_solved(damped, state.gradient)
-    turn, move = (jnp.linalg.norm(part, axis=-1) for part in (step[:, :3], step[:, 3:]))
-    longest = jnp.maximum(jnp.maximum(turn / LARGEST_TURN, move / LARGEST_MOVE), 1.0)
-    step = step / longest[:, None]
-    curved = jnp.sum(step * jnp.sum(state.hessian * step[:, None], axis=-1), axis=-1)
-    return step, -jnp.sum(state.gradient * step, axis=-1) - curved / 2
-
-
-def _solved(matrix, right):
-    """Solutions of positive definite systems (poses, 6, 6), by elimination; no pivots are needed."""
-
-    def eliminate(k, system):
-        row = system[:, k] / system[:, k, k][:, None]
-        return (system - system[:, :, k, None] * row[:, None]).at[:, k].set(row)
-
-    return jax.lax.fori_loop(0, 6, eliminate, jnp.concatenate([matrix, right[..., None]], axis=-1))[..., -1]
-
-
-def _evaluate(R, place, waypoint, bounds, field, problem, energy, chunk):
-    """Energies of the poses within the bounds and their quadratic models: (poses,), (poses, 6), (poses, 6, 6)."""
-    _, last, blocks, _ = bounds
-    count = min(max(1, chunk // problem.query.shape[1]), len(R))
-    used = jnp.sum(jnp.where(jnp.arange(len(problem.weights)) < blocks, jnp.sum(problem.weights, axis=1), 0.0))
-
-    def some(j, values):
-        # The last chunk begins early rather than run over the end.
-        begin = jnp.minimum(j * count, len(R) - count)
-        R_, place_, waypoint_ = (jax.lax.dynamic_slice_in_dim(part, begin, count) for part in (R, place, waypoint))
-
-        def block(b, total):
-            terms = _match(R_, place_, field, problem.query[b], problem.weights[b] / used, problem.descriptors[waypoint_, b])
-            return jax.tree.map(jnp.add, total, terms)
-
-        total = jax.lax.fori_loop(0, blocks, block, tuple(jnp.zeros_like(part[:count]) for part in values))
-        return jax.tree.map(lambda whole, part: jax.lax.dynamic_update_slice_in_dim(whole, part, begin, 0), values, total)
-
-    values = tuple(jnp.zeros((len(R), *shape), R.dtype) for shape in ((), (6,), (6, 6)))
-    values = jax.lax.fori_loop(0, (last + count - 1) // count, some, values)
-    prior = jax.vmap(lambda R, place, target: _prior(R, place, target, field.origin, problem.centre, energy))
-    return jax.tree.map(jnp.add, values, prior(R, place, problem.target[waypoint]))
-
-
-def _match(R, place, field, query, weights, shown):
-    """Weighted sums over query points of the mean absolute difference of descriptors, its gradient and its model's curvature."""
-    arm = poses.rotate(R, query)
-    x = (arm + place[:, None]).reshape(-1, 3)
-
-    def along(axis):
-        return jax.jvp(field.descriptors, (x,), (jnp.broadcast_to(axis, x.shape),))
-
-    found, tangents = jax.vmap(along, out_axes=(None, 1))(jnp.eye(3, dtype=x.dtype))  # (points, channels), (points, 3, channels)
-    residual = found - shown.reshape(found.shape)
-    size = jnp.abs(residual)
-    mean = jnp.mean(size, axis=-1)
-    weights = jnp.tile(weights, len(R))
-    share = (weights / size.shape[-1])[:, None]
-    slope = jnp.einsum("pic,pc->pi", tangents, jnp.sign(residual) * share)
-    weighted = tangents * (share / jnp.maximum(jnp.maximum(size, mean[:, None]), 1e-9))[:, None]
-    curvature = jnp.einsum("pic,pjc->pij", tangents, weighted)
-
-    slope, curvature = slope.reshape(*arm.shape[:2], 3), curvature.reshape(*arm.shape[:2], 3, 3)
-    # A turn w moves a point by w x arm, a move v by v: rows of the jacobian (poses, size, 6, 3).
-    identity = jnp.broadcast_to(jnp.eye(3, dtype=x.dtype), curvature.shape)
-    jacobian = jnp.concatenate([jnp.cross(identity, arm[..., None, :]), identity], axis=-2)
-    gradient = jnp.einsum("pqai,pqi->pa", jacobian, slope)
-    hessian = jnp.einsum("pqai,pqbi->pab", jacobian, jacobian @ curvature)
-    return jnp.sum((weights * mean).reshape(arm.shape[:2]), axis=1), gradient, hessian
-
-
-def _prior(R, place, target, origin, centre, energy):
-    """One pose's weighted part of eq. 3, its gradient and its model's curvature."""
-
-    def difference(R, place):
-        return pose_difference(R, place - R @ centre, origin, target, energy.lever, energy.pose_norm)
-
-    # Along a turn about each axis, which changes R by axis x R, and a move along each.
-    identity, zeros = jnp.eye(3, dtype=R.dtype), jnp.zeros((3, 3), R.dtype)
-    turns = jnp.cross(identity[:, None], R.T[None]).swapaxes(1, 2)
-    along = jnp.concatenate([turns, jnp.zeros_like(turns)]), jnp.concatenate([zeros, identity])
-    value, rows = jax.vmap(lambda *step: jax.jvp(difference, (R, place), step), out_axes=(None, 0))(*along)
-    if energy.pose_norm == "mean_absolute":
-        length, share = jnp.abs(value), energy.correlation / len(value)
-        loss = share * jnp.sum(length)
-    else:
-        length, share = jnp.sqrt(jnp.sum(value * value)), energy.correlation
-        loss = share * length
-    weighted = rows * (share / jnp.maximum(length, LEAST_DIFFERENCE))
-    return loss, weighted @ value, weighted @ rows.T

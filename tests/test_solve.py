@@ -11,7 +11,7 @@ from conftest import carried, compilations, composed, random_cloud, random_poses
 from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
-from tdf_jax import poses
+from tdf_jax import descent, poses
 from tdf_jax.energy import pose_energy, waypoint_loss
 from tdf_jax.errors import InputError
 from tdf_jax.optimize import default_goal, random_starts
@@ -55,7 +55,7 @@ def test_energies_and_gradients_are_those_of_the_energy(field, reference, pose_n
     drawn = solve._candidates(starts, problem)
     R, place = drawn.R.reshape(-1, 3, 3), drawn.place.reshape(-1, 3)
     waypoint = np.tile(np.arange(4), 5)
-    values = solve._evaluate(R, place, waypoint, np.array([20, 20, 3, 0]), field, problem, weights, 128)
+    values = descent._evaluate(R, place, waypoint, np.array([20, 20, 3, 0]), field, problem, weights, 128)
 
     def energy(step, R, place, index):
         R, place = moved(R, place, step)
@@ -82,7 +82,7 @@ def test_the_curvature_is_that_of_reweighted_squares(field, reference):
     size = np.abs(value)
     weights = 1 / np.maximum(size, size.mean(axis=-1, keepdims=True)) / value.size
     expected = np.einsum("qca,qc,qcb->ab", jacobian, weights, jacobian)
-    _, _, hessian = solve._match(R, place, field, problem.query[0], problem.weights[0] / 8, shown)
+    _, _, hessian = descent._match(R, place, field, problem.query[0], problem.weights[0] / 8, shown)
     np.testing.assert_allclose(hessian[0], expected, atol=1e-4 * np.abs(expected).max())
 
 
@@ -90,17 +90,17 @@ def test_a_step_solves_the_damped_system_and_is_bounded():
     rng = np.random.default_rng(0)
     half = rng.normal(size=(4, 6, 6))
     hessian, gradient = half @ half.swapaxes(1, 2) + np.eye(6), 1e-3 * rng.normal(size=(4, 6))
-    state = solve._State(jnp.zeros((4, 3, 3)), jnp.zeros((4, 3)), jnp.ones(4), jnp.float32(gradient), jnp.float32(hessian))
+    state = descent._State(jnp.zeros((4, 3, 3)), jnp.zeros((4, 3)), jnp.ones(4), jnp.float32(gradient), jnp.float32(hessian))
     damping = jnp.array([0.1, 1.0, 0.0, 10.0])
-    step, promise = solve._step(state, damping)
+    step, promise = descent._step(state, damping)
     damped = hessian + np.asarray(damping)[:, None, None] * hessian * np.eye(6)
     expected = -np.linalg.solve(damped, gradient[..., None])[..., 0]
     np.testing.assert_allclose(step, expected, rtol=1e-3, atol=1e-7)
     fall = -(gradient * expected).sum(axis=1) - np.einsum("ca,cab,cb->c", expected, hessian, expected) / 2
     np.testing.assert_allclose(promise, fall, rtol=1e-3)
-    long, _ = solve._step(state._replace(gradient=1e4 * state.gradient), damping)
-    assert np.linalg.norm(long[:, :3], axis=1).max() <= solve.LARGEST_TURN * (1 + 1e-6)
-    assert np.linalg.norm(long[:, 3:], axis=1).max() <= solve.LARGEST_MOVE * (1 + 1e-6)
+    long, _ = descent._step(state._replace(gradient=1e4 * state.gradient), damping)
+    assert np.linalg.norm(long[:, :3], axis=1).max() <= descent.LARGEST_TURN * (1 + 1e-6)
+    assert np.linalg.norm(long[:, 3:], axis=1).max() <= descent.LARGEST_MOVE * (1 + 1e-6)
     cosine = (long * expected).sum(axis=1) / np.linalg.norm(long, axis=1) / np.linalg.norm(expected, axis=1)
     np.testing.assert_allclose(cosine, 1, atol=1e-4)
 
@@ -110,7 +110,7 @@ def test_chunks_do_not_show(field, reference):
     drawn = solve._candidates(random_starts(KEY, field, reference, 2, "carried", 0.1), problem)
     settings = (drawn.R.reshape(-1, 3, 3), drawn.place.reshape(-1, 3), np.tile(np.arange(4), 2), np.array([8, 8, 3, 0]), field, problem, WEIGHTS)
     # 3 poses at a time: the last chunk overlaps the one before.
-    for part, expected in zip(solve._evaluate(*settings, 9), solve._evaluate(*settings, 128), strict=True):
+    for part, expected in zip(descent._evaluate(*settings, 9), descent._evaluate(*settings, 128), strict=True):
         np.testing.assert_allclose(part, expected, rtol=1e-4, atol=1e-6)
 
 
@@ -124,7 +124,8 @@ def test_carried_candidates_are_rigid_motions_of_the_demonstration(field, refere
     energy = np.random.default_rng(0).uniform(size=(4, 3))
     found = Candidates(drawn.R[:, :3], drawn.place[:, :3], energy)
     picked = Candidates(drawn.R[2:, 1:2], drawn.place[2:, 1:2])
-    new = np.array(solve._poses(solve._carried(found, picked, 1, problem, field.origin), problem), np.float64)
+    shown_candidates = solve._candidates(reference.trajectory.wxyz_xyz, problem)
+    new = np.array(solve._poses(solve._carried(found, picked, 1, shown_candidates, field.origin), problem), np.float64)
     assert new.shape == (6, 3, 7)
     shown = np.array(reference.trajectory.shifted(field.origin).wxyz_xyz[:3], np.float64)
     for index, (row, waypoint) in enumerate([*((row, waypoint) for waypoint, row in enumerate(energy.argmin(axis=0))), (2, 1), (3, 1)]):
@@ -247,7 +248,7 @@ def test_stages_and_what_is_traced_share_one_program(small_model, field, referen
         for weight in (0, 0.5, jnp.array(0.1)):
             run(other, reference, key=jax.random.key(5), energy=tdf.EnergyWeights(correlation=weight, lever=weight))
         run(field, reference, config=dataclasses.replace(CONFIG, tolerance=0.1))
-    assert not {"jit(_descend)", "jit(_random_starts)"} & set(compiled)
+    assert not {"jit(descend)", "jit(_random_starts)"} & set(compiled)
 
 
 # ---- bad input ----
