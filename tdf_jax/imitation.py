@@ -49,7 +49,7 @@ def imitate(
         The result; `.trajectory` is the best one, T_world_query.
 
     Raises:
-        InputError: bad points, goal or offset.
+        InputError: bad points, goal, offset or settings.
     """
     check_key("imitate()", key)
     reference = demonstration if isinstance(demonstration, Reference) else describe(model, demonstration)
@@ -58,6 +58,8 @@ def imitate(
     if goal_offset is not None:
         goal = default_goal(field, reference) if goal is None else goal
         goal = goal + jnp.pad(_finite("goal_offset", goal_offset, (3,)), (4, 0))
+    if not isinstance(config, SolveConfig | OptimizeConfig):
+        raise InputError(f"imitate(): config is {config!r}; expected a SolveConfig or an OptimizeConfig")
     minimise = optimize if isinstance(config, OptimizeConfig) else solve
     return minimise(field, reference, key, goal=goal, fix_last=fix_last, energy=energy, config=config, progress=progress, mesh=mesh)
 

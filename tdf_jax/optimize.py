@@ -162,7 +162,7 @@ def optimize(
     Raises:
         InputError: starts, goal or weights of a wrong shape or value, or a reference from another network than the field.
     """
-    starts, energy = prepare("optimize()", field, reference, key, goal, fix_last, energy, config, starts)
+    starts, energy = prepare("optimize()", field, reference, key, goal, fix_last, energy, config, starts, mesh)
     inits, dtype = len(starts), starts.dtype
     starts = jnp.asarray(starts)
     count = config.chunk or max(1, devices.points_at_a_time(CHUNK_POINTS) // len(reference.query))
@@ -196,6 +196,7 @@ def prepare(
     energy: EnergyWeights,
     config,
     starts: Float[Array, "inits poses 7"] | None,
+    mesh: jax.sharding.Mesh | None,
 ) -> tuple[Float[np.ndarray, "inits poses 7"], EnergyWeights]:
     """Checked starts, which end at the goal if there is one, and weights of the same type; see `optimize`.
 
@@ -204,8 +205,12 @@ def prepare(
         config: with `inits`, `start` and `start_radius`.
 
     Raises:
-        InputError: starts, goal or weights of a wrong shape or value, or a reference from another network than the field.
+        InputError: starts, goal or weights of a wrong shape, type or value, or a reference from another network than the field.
     """
+    if not isinstance(energy, EnergyWeights):
+        raise InputError(f"{function}: energy is {energy!r}; expected EnergyWeights, such as EnergyWeights(correlation=0.02)")
+    if mesh is not None and not isinstance(mesh, jax.sharding.Mesh):
+        raise InputError(f"{function}: mesh is {mesh!r}; expected a jax.sharding.Mesh, such as jax.make_mesh((2,), ('starts',))")
     channels = field.conditioned.config.channels
     if reference.descriptors.shape[-1] != channels:
         raise InputError(

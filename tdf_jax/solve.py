@@ -127,13 +127,13 @@ def solve(
         InputError: as for `optimize`, or a weight on eq. 6, which couples the waypoints.
     """
     check_key("solve()", key)
-    if np.any(np.asarray(energy.compensator) != 0):
-        raise InputError(
-            f"solve(): energy.compensator is {energy.compensator}; expected 0, for the solver takes waypoints one by one. Use optimize(), or imitate() with config=OptimizeConfig()"
-        )
     most = dataclasses.replace(config, inits=max(config.inits, config.scouts))
     given = starts is not None
-    starts, energy = prepare("solve()", field, reference, key, goal, fix_last, energy, most, starts)
+    starts, energy = prepare("solve()", field, reference, key, goal, fix_last, energy, most, starts, mesh)
+    if energy.compensator != 0:
+        raise InputError(
+            f"solve(): energy.compensator is {float(energy.compensator):g}; expected 0, for the solver takes waypoints one by one. Use optimize(), or imitate() with config=OptimizeConfig()"
+        )
     n = starts.shape[1]
     free = n - 1 if fix_last else n
     if free == 0:

@@ -144,6 +144,14 @@ def small_model():
 
 
 @pytest.fixture(scope="session")
+def weights(small_model, tmp_path_factory):
+    """A file of the small network's weights, for commands."""
+    path = tmp_path_factory.mktemp("weights") / "small.safetensors"
+    tdf.save_model(dataclasses.replace(small_model, info=tdf.ModelInfo("small", "a test", cloud_points=40)), path)
+    return path
+
+
+@pytest.fixture(scope="session")
 def demonstration():
     """4 poses, 8 query points: with clouds of 40 points, the shapes that most tests share, to compile once."""
     return tdf.Demonstration(

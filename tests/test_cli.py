@@ -24,13 +24,6 @@ TINY = (*QUICK, "--poses", 4, "--queries", 8)
 FILES = {"result.json", "trajectory.npz", "trajectory.tum", "imitation.png", "loss.png"}
 
 
-@pytest.fixture(scope="module")
-def weights(small_model, tmp_path_factory):
-    path = tmp_path_factory.mktemp("weights") / "small.safetensors"
-    tdf.save_model(dataclasses.replace(small_model, info=tdf.ModelInfo("small", "a test", cloud_points=40)), path)
-    return path
-
-
 def run(*words):
     main([str(word) for word in words])
 

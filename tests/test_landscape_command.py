@@ -17,13 +17,6 @@ from tdf_jax.recording import save_demonstration
 QUICK = ("--points", 60, "--poses", 3, "--queries", 8, "--half", 0.1, "--pitch", 0.05)
 
 
-@pytest.fixture(scope="module")
-def weights(small_model, tmp_path_factory):
-    path = tmp_path_factory.mktemp("weights") / "small.safetensors"
-    tdf.save_model(dataclasses.replace(small_model, info=tdf.ModelInfo("small", "a test", cloud_points=40)), path)
-    return path
-
-
 def run(*words):
     main([str(word) for word in words])
 
