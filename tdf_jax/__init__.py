@@ -20,6 +20,7 @@ from tdf_jax.meshes import load_mesh, sample_surface
 from tdf_jax.model import Model, ModelInfo, encode
 from tdf_jax.network import NetworkConfig
 from tdf_jax.optimize import OptimizeConfig, Result, optimize
+from tdf_jax.paths import hang_on_rack, lift_over, line, semicircle, tilt_and_pour, wave
 from tdf_jax.pointcloud import load_points, thin
 from tdf_jax.query import box_query, gaussian_query, gripper_query, lattice_query, snapped_query
 from tdf_jax.refinement import refine
@@ -27,16 +28,7 @@ from tdf_jax.route import lowest_cost_path
 from tdf_jax.shapes import MugParameters, build_mug, sample_mug
 from tdf_jax.solve import SolveConfig, solve
 from tdf_jax.sweep import energy_landscape
-from tdf_jax.trajectory import (
-    Trajectory,
-    displace,
-    line,
-    load_trajectory,
-    resample,
-    save_trajectory,
-    semicircle,
-    wave,
-)
+from tdf_jax.trajectory import Trajectory, displace, load_trajectory, resample, save_trajectory
 
 __version__ = "0.1.0"
 __all__ = [name for name in dir() if not name.startswith("_")]

@@ -1,4 +1,4 @@
-"""Trajectories of a query frame: the line, semicircle and wave of the paper, resampling, displacing, files."""
+"""Trajectories of a query frame: resampling, displacing, checks, files."""
 
 import zipfile
 from dataclasses import dataclass
@@ -71,7 +71,7 @@ class Trajectory:
         if not isinstance(T, jax.core.Tracer):
             if not np.isfinite(T).all():
                 raise InputError("Trajectory.from_matrices(): a matrix is NaN or infinite; expected rigid transforms.")
-            _check_rotations("Trajectory.from_matrices", T[:, :3, :3])
+            check_rotations("Trajectory.from_matrices", T[:, :3, :3])
             if not np.allclose(T[:, 3], [0, 0, 0, 1], atol=1e-6):
                 raise InputError("Trajectory.from_matrices(): the last row of a matrix is not 0 0 0 1, as expected.")
         return check_trajectory(cls(se3.pose(T[:, :3, :3], T[:, :3, 3])))
@@ -135,108 +135,6 @@ def check_trajectory(trajectory: Trajectory, name: str = "trajectory") -> Trajec
     return trajectory
 
 
-def line(
-    poses: int = 7,
-    start: ArrayLike = (0.0, 0.0, 0.0),
-    end: ArrayLike = (0.0, 0.3, 0.0),
-    *,
-    rotation: ArrayLike | None = None,
-    end_rotation: ArrayLike | None = None,
-) -> Trajectory:
-    """Straight trajectory, evenly spaced.
-
-    Args:
-        poses: Number of poses, at least 2.
-        start: Translation of the first pose, metres.
-        end: Translation of the last pose, metres.
-        rotation: Orientation, 3x3 or wxyz; default the world's.
-        end_rotation: Orientation of the last pose, reached by the shortest even turn; default no turn.
-
-    Returns:
-        The trajectory.
-
-    Raises:
-        InputError: If an argument has a wrong shape or value, or start and end are the same place.
-    """
-    return _trajectory("line", poses, start, end, rotation, end_rotation, lambda s, chord: (s * chord, 0 * s))
-
-
-def semicircle(
-    poses: int = 7,
-    start: ArrayLike = (0.0, 0.0, 0.0),
-    end: ArrayLike = (0.0, 0.3, 0.0),
-    *,
-    height: float | None = None,
-    bulge: ArrayLike = (1.0, 0.0, 0.0),
-    rotation: ArrayLike | None = None,
-    end_rotation: ArrayLike | None = None,
-) -> Trajectory:
-    """Circular arc from start to end, evenly spaced; by default half a circle.
-
-    Args:
-        poses, start, end, rotation, end_rotation: As for `line`.
-        height: Distance of the arc's middle from the chord, metres; default half the chord, a half circle.
-        bulge: Direction the arc bows to; its part perpendicular to the chord counts. The default keeps the default
-            ends' path in the x-y plane, as in the paper's figure 2; (0, 0, 1) lifts it.
-
-    Returns:
-        The trajectory.
-
-    Raises:
-        InputError: If an argument has a wrong shape or value, start and end are the same place, or bulge is along
-            the chord.
-    """
-
-    def arc(s, chord):
-        sagitta = chord / 2 if height is None else height
-        half_angle = 2 * np.arctan2(2 * sagitta, chord)
-        radius = chord / 2 / np.sin(half_angle)
-        angle = half_angle * (2 * s - 1)
-        return chord / 2 + radius * np.sin(angle), radius * (np.cos(angle) - np.cos(half_angle))
-
-    return _trajectory("semicircle", poses, start, end, rotation, end_rotation, arc, height, bulge)
-
-
-def wave(
-    poses: int = 7,
-    start: ArrayLike = (0.0, 0.0, 0.0),
-    end: ArrayLike = (0.0, 0.3, 0.0),
-    *,
-    height: float | None = None,
-    bulge: ArrayLike = (1.0, 0.0, 0.0),
-    rotation: ArrayLike | None = None,
-    end_rotation: ArrayLike | None = None,
-) -> Trajectory:
-    """One period of a sine from start to end, first to the side of bulge; poses evenly spaced along the curve.
-
-    Args:
-        poses, start, end, rotation, end_rotation: As for `line`.
-        height: Amplitude, metres; default a quarter of the chord.
-        bulge: Direction of the first crest; its part perpendicular to the chord counts. The default keeps the
-            default ends' path in the x-y plane, as in the paper's figure 2; (0, 0, 1) lifts it first.
-
-    Returns:
-        The trajectory.
-
-    Raises:
-        InputError: If an argument has a wrong shape or value, start and end are the same place, or bulge is along
-            the chord.
-    """
-
-    def sine(s, chord):
-        amplitude = chord / 4 if height is None else height
-        fine = np.linspace(0, 1, 4001)  # the curve's length is then exact to 1e-6 of it
-        along, across = chord * fine, amplitude * np.sin(2 * np.pi * fine)
-        length = np.concatenate([[0], np.cumsum(np.hypot(np.diff(along), np.diff(across)))])
-        even = np.interp(s * length[-1], length, fine)
-        return chord * even, amplitude * np.sin(2 * np.pi * even)
-
-    return _trajectory("wave", poses, start, end, rotation, end_rotation, sine, height, bulge)
-
-
-SHAPES = {"line": line, "semicircle": semicircle, "wave": wave}
-
-
 def resample(trajectory: Trajectory, poses: int) -> Trajectory:
     """The same path with another number of poses, evenly spaced by the length of the translations' polyline.
 
@@ -253,7 +151,7 @@ def resample(trajectory: Trajectory, poses: int) -> Trajectory:
     Raises:
         InputError: If poses is below 2 or the trajectory fails `check_trajectory`.
     """
-    _check_count("resample", poses)
+    check_count("resample", poses)
     check_trajectory(trajectory)
     R, t = trajectory.rotations, trajectory.translations
     steps = jnp.linalg.norm(jnp.diff(t, axis=0), axis=1)
@@ -285,7 +183,7 @@ def displace(
     if where not in ("start", "goal"):
         raise InputError(f"displace(): where is {where!r}; expected 'start' or 'goal'.")
     if not isinstance(offset, jax.core.Tracer):
-        offset = _vector("displace", "offset", offset)
+        offset = checked_vector("displace", "offset", offset)
     wxyz_xyz = jnp.asarray(check_trajectory(trajectory).wxyz_xyz)
     return Trajectory(wxyz_xyz.at[0 if where == "start" else -1, 4:].add(jnp.asarray(offset, wxyz_xyz.dtype)))
 
@@ -364,55 +262,22 @@ def _known_suffix(function: str, path: str | Path) -> Path:
     return path
 
 
-def _check_count(function: str, poses: int) -> None:
+def check_count(function: str, poses: int) -> None:
+    """Raise InputError unless there can be so many poses."""
     if not isinstance(poses, int | np.integer) or poses < 2:
         raise InputError(f"{function}(): poses is {poses}; expected a whole number of at least 2, pick and place.")
 
 
-def _check_rotations(function: str, R: ArrayLike) -> None:
+def check_rotations(function: str, R: ArrayLike) -> None:
+    """Raise InputError unless all are rotation matrices."""
     R = np.asarray(R, dtype=np.float64)
     if not (np.allclose(R @ np.swapaxes(R, -1, -2), np.eye(3), atol=1e-3) and (np.linalg.det(R) > 0).all()):
         raise InputError(f"{function}(): a rotation matrix is not orthonormal with determinant 1, or not finite.")
 
 
-def _vector(function: str, name: str, value: ArrayLike) -> np.ndarray:
+def checked_vector(function: str, name: str, value: ArrayLike) -> np.ndarray:
+    """Three finite numbers as float64, or InputError."""
     vector = np.asarray(value, dtype=np.float64)
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise InputError(f"{function}(): {name} is {value}; expected three finite numbers, metres.")
     return vector
-
-
-def _rotation(function: str, rotation: ArrayLike) -> Float[Array, "3 3"]:
-    rotation = np.asarray(rotation, dtype=np.float64)
-    if rotation.shape == (4,):
-        if not (np.isfinite(rotation).all() and rotation.any()):
-            raise InputError(f"{function}(): rotation wxyz is {rotation}; expected a finite quaternion, not zero.")
-        return se3.matrix_from_wxyz(jnp.asarray(rotation))
-    if rotation.shape != (3, 3):
-        raise InputError(f"{function}(): rotation has shape {rotation.shape}; expected (3, 3), or (4,) as wxyz.")
-    _check_rotations(function, rotation)
-    return jnp.asarray(rotation)
-
-
-def _trajectory(function, poses, start, end, rotation, end_rotation, curve, height=None, bulge=None) -> Trajectory:
-    """Poses along `curve`: fractions in [0, 1] and the chord's length -> distances along the chord and across it."""
-    _check_count(function, poses)
-    start, end = _vector(function, "start", start), _vector(function, "end", end)
-    chord = np.linalg.norm(end - start)
-    if not chord > 0:
-        raise InputError(f"{function}(): start and end are both {start.tolist()}; expected two places.")
-    if height is not None and not (np.isfinite(height) and height > 0):
-        raise InputError(f"{function}(): height is {height}; expected metres above 0. Turn bulge for the other side.")
-    forward, side = (end - start) / chord, np.zeros(3)
-    if bulge is not None:
-        bulge = _vector(function, "bulge", bulge)
-        side = bulge - forward * (forward @ bulge)
-        if not np.linalg.norm(side) > 1e-6 * np.linalg.norm(bulge):
-            raise InputError(f"{function}(): bulge {bulge.tolist()} is zero or along the chord; expected a way aside.")
-        side /= np.linalg.norm(side)
-    fractions = np.linspace(0, 1, poses)
-    along, across = curve(fractions, chord)
-    translations = start + along[:, None] * forward + across[:, None] * side
-    R_start = _rotation(function, np.eye(3) if rotation is None else rotation)
-    R_end = R_start if end_rotation is None else _rotation(function, end_rotation)
-    return Trajectory(se3.pose(se3.geodesic(R_start, R_end, fractions), jnp.asarray(translations)))

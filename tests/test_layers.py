@@ -11,7 +11,7 @@ import tdf_jax
 
 PACKAGE = Path(tdf_jax.__file__).parent
 ORDER = """
-    errors keys files poses trajectory query meshes pointcloud views network field model refinement checkpoint torch_pickle convert
+    errors keys files poses trajectory paths query meshes pointcloud views network field model refinement checkpoint torch_pickle convert
     descriptor demonstration recording energy devices descent optimize solve grid landscape lattice sweep route imitation
     shapes evaluation training viz experiments cli
 """.split()

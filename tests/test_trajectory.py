@@ -1,4 +1,4 @@
-"""Trajectories: the three paths of the paper by hand, resampling, displacing, files and their damage."""
+"""Trajectories: resampling, displacing, files and their damage."""
 
 import jax
 import jax.numpy as jnp
@@ -8,19 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from tdf_jax.errors import InputError
-from tdf_jax.trajectory import (
-    Trajectory,
-    check_trajectory,
-    displace,
-    line,
-    load_trajectory,
-    resample,
-    save_trajectory,
-    semicircle,
-    wave,
-)
+from tdf_jax.paths import line, semicircle, wave
+from tdf_jax.trajectory import Trajectory, check_trajectory, displace, load_trajectory, resample, save_trajectory
 
-PATHS = [line, semicircle, wave]
 IDENTITY = np.array([1, 0, 0, 0, 0, 0, 0], np.float32)
 
 
@@ -61,100 +51,6 @@ def test_transformed_multiplies_from_the_left():
     trajectory, T_new_world = random_trajectory(), random_trajectory(seed=1).wxyz_xyz[0]
     expected = np.array(jaxlie.SE3(T_new_world).as_matrix()) @ np.array(trajectory.matrices)
     np.testing.assert_allclose(trajectory.transformed(T_new_world).matrices, expected, atol=1e-5)
-
-
-def test_the_default_line_by_hand():
-    expected = [[0, 0.05 * i, 0] for i in range(7)]
-    np.testing.assert_allclose(line().translations, expected, atol=1e-7)
-    np.testing.assert_array_equal(line().wxyz_xyz[:, :4], np.tile(IDENTITY[:4], (7, 1)))
-
-
-def test_the_default_semicircle_by_hand():
-    """Steps of 30 degrees about the chord's middle, radius 0.15, towards +x."""
-    angles = np.deg2rad(30 * np.arange(7))
-    expected = 0.15 * np.stack([np.sin(angles), 1 - np.cos(angles), 0 * angles], axis=1)
-    np.testing.assert_allclose(semicircle().translations, expected, atol=1e-7)
-
-
-def test_the_default_wave_by_hand():
-    """One sine of amplitude 0.3 / 4: its crest is at a quarter of the way, its middle on the chord."""
-    t = np.array(wave(poses=9).translations)
-    np.testing.assert_allclose(t[[0, 2, 4, 6, 8], 0], [0, 0.075, 0, -0.075, 0], atol=1e-6)
-    np.testing.assert_allclose(t[[0, 2, 4, 6, 8], 1], [0, 0.075, 0.15, 0.225, 0.3], atol=1e-6)
-    np.testing.assert_allclose(t[:, 0], 0.075 * np.sin(2 * np.pi * t[:, 1] / 0.3), atol=1e-6)
-    np.testing.assert_array_equal(t[:, 2], 0)
-
-
-def test_heights_and_bulges():
-    arc = np.array(semicircle(3, (0, 0, 0), (2, 0, 0), height=0.5, bulge=(7, 0, 3)).translations)
-    np.testing.assert_allclose(arc, [[0, 0, 0], [1, 0, 0.5], [2, 0, 0]], atol=1e-6)
-    # Over half a circle: chord 2 and height 2 give radius 1.25 about a centre 0.75 above the chord.
-    deep = np.array(semicircle(21, (0, 0, 0), (2, 0, 0), height=2, bulge=(0, 0, 1)).translations)
-    np.testing.assert_allclose(np.linalg.norm(deep - [1, 0, 0.75], axis=1), 1.25, atol=1e-6)
-    crest = np.array(wave(5, (0, 0, 0), (0, 0, 4), height=0.5, bulge=(0, -1, 9)).translations)
-    np.testing.assert_allclose(crest[1::2], [[0, -0.5, 1], [0, 0.5, 3]], atol=1e-5)
-
-
-@pytest.mark.parametrize("path", PATHS)
-@pytest.mark.parametrize("poses", [2, 5, 60])
-def test_paths_keep_their_ends_and_are_evenly_spaced(path, poses):
-    start, end = (0.1, -0.2, 0.3), (-0.4, 0.5, 0.1)
-    trajectory = path(poses, start, end)
-    assert trajectory.poses == poses
-    assert trajectory.wxyz_xyz.dtype == jnp.float32
-    np.testing.assert_allclose(trajectory.translations[0], start, atol=1e-7)
-    np.testing.assert_allclose(trajectory.translations[-1], end, atol=1e-7)
-    if poses == 60:  # few poses cut corners
-        steps = np.linalg.norm(np.diff(np.array(trajectory.translations), axis=0), axis=1)
-        np.testing.assert_allclose(steps, steps.mean(), rtol=5e-3)
-
-
-@pytest.mark.parametrize("path", PATHS)
-def test_orientations_turn_evenly_from_one_to_the_other(path):
-    first, last = Rotation.from_rotvec([0.3, -0.5, 1]), Rotation.from_rotvec([-1, 0.2, 0.4])
-    fixed = path(4, rotation=first.as_matrix())
-    np.testing.assert_allclose(fixed.rotations, np.tile(first.as_matrix(), (4, 1, 1)), atol=1e-6)
-    turning = path(5, rotation=3 * first.as_quat(scalar_first=True), end_rotation=last.as_matrix())
-    expected = Slerp([0, 1], Rotation.concatenate([first, last]))(np.linspace(0, 1, 5)).as_matrix()
-    np.testing.assert_allclose(turning.rotations, expected, atol=1e-6)
-    np.testing.assert_array_equal(turning.translations, path(5).translations)
-
-
-@pytest.mark.parametrize("path", PATHS)
-def test_paths_refuse_bad_arguments(path):
-    name = path.__name__
-    for poses in (1, 0, -3, 2.5):
-        with pytest.raises(InputError, match=rf"{name}\(\): poses is {poses}; expected a whole number of at least 2"):
-            path(poses)
-    for bad in ((0, 0), (0, 0, np.nan), 3.0, (0, np.inf, 0)):
-        with pytest.raises(InputError, match=rf"{name}\(\): start is .*expected three finite numbers"):
-            path(start=bad)
-        with pytest.raises(InputError, match=rf"{name}\(\): end is .*expected three finite numbers"):
-            path(end=bad)
-    with pytest.raises(InputError, match=r"start and end are both \[0.0, 0.3, 0.0\]"):
-        path(start=(0, 0.3, 0))
-    for bad in (np.diag([1.0, 1, -1]), 2 * np.eye(3), np.full((3, 3), np.nan)):
-        with pytest.raises(InputError, match="not orthonormal with determinant 1, or not finite"):
-            path(rotation=bad)
-        with pytest.raises(InputError, match="not orthonormal with determinant 1, or not finite"):
-            path(end_rotation=bad)
-    for bad in (np.zeros(4), np.full(4, np.nan)):
-        with pytest.raises(InputError, match="expected a finite quaternion, not zero"):
-            path(rotation=bad)
-    with pytest.raises(InputError, match=r"rotation has shape \(3,\)"):
-        path(rotation=np.zeros(3))
-
-
-@pytest.mark.parametrize("path", [semicircle, wave])
-def test_curved_paths_refuse_bad_heights_and_bulges(path):
-    for height in (0, -0.1, np.nan, np.inf):
-        with pytest.raises(InputError, match="height is .*; expected metres above 0"):
-            path(height=height)
-    for bulge in ((0, 1, 0), (0, -2, 0), (0, 0, 0)):
-        with pytest.raises(InputError, match="is zero or along the chord"):
-            path(bulge=bulge)
-    with pytest.raises(InputError, match="bulge is .*; expected three finite numbers"):
-        path(bulge=(1, 0))
 
 
 def test_resampling_by_hand():

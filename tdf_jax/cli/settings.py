@@ -39,7 +39,7 @@ class SceneSettings:
     scale: float = 1.0
     target_pose: Annotated[Literal["given", "random"] | None, _option(default="given for a file, random for a generated mug")] = None
     demonstration: Annotated[Path | None, _option("FILE", "one on another generated mug")] = None
-    trajectory: Annotated[Literal["line", "semicircle", "wave"] | None, _option(default="wave")] = None
+    trajectory: Annotated[Literal["line", "semicircle", "wave", "lift_over", "tilt_and_pour", "hang_on_rack"] | None, _option(default="wave")] = None
     poses: Annotated[int | None, _option("INT", "7, or those of the demonstration file")] = None
     queries: Annotated[int | None, _option("INT", "128")] = None
     points: int = 1500

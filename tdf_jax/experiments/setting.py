@@ -16,9 +16,10 @@ from tdf_jax.evaluation.scene import Scene
 from tdf_jax.field import DescriptorField
 from tdf_jax.meshes import sample_surface
 from tdf_jax.optimize import STARTS, OptimizeConfig, default_goal
+from tdf_jax.paths import SHAPES
 from tdf_jax.query import box_query, gaussian_query
 from tdf_jax.shapes import Mug, scaled
-from tdf_jax.trajectory import SHAPES, Trajectory
+from tdf_jax.trajectory import Trajectory
 
 QUERIES = ("box", "gaussian")
 CORRELATED = ("demonstration", "stretched")
