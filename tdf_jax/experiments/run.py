@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from tdf_jax.demonstration import describe
 from tdf_jax.energy import descriptor_loss, trajectory_energy
+from tdf_jax.evaluation.motion import longest_step
 from tdf_jax.evaluation.truth import FLIP_DEGREES, pose_error, shape_error
 from tdf_jax.experiments import setting as settings
 from tdf_jax.experiments.setting import Setting
@@ -101,9 +102,8 @@ class Run:
 
     @property
     def longest_step(self) -> float:
-        """Largest distance of neighbouring poses over their mean distance; the demonstration's is 1 where it is evenly spaced."""
-        steps = np.linalg.norm(np.diff(self.trajectory[:, 4:], axis=0), axis=1)
-        return float(steps.max() / steps.mean())
+        """See `tdf_jax.evaluation.motion.longest_step`; the demonstration's is 1 where it is evenly spaced."""
+        return longest_step(self.trajectory[:, 4:])
 
 
 def imitation(model: Model, setting: Setting) -> Run:
