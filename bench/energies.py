@@ -1,0 +1,105 @@
+"""Does the solver come as far down as Adam? Energies of both on pairs of unseen mugs and on the rows of the paper's table 1.
+
+`python -m bench.energies` asks for 50 pairs and nine rows, about 20 s each on two cores. What is done is kept in the file, and not done again.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+
+import tdf_jax as tdf
+from tdf_jax.errors import InputError
+from tdf_jax.evaluation.cases import mug_case
+from tdf_jax.experiments import setting as settings
+from tdf_jax.experiments.table import PAPER
+from tdf_jax.files import replace_file
+from tdf_jax.optimize import default_goal
+from tdf_jax.paths import SHAPES
+
+QUERIES, QUERY_SIZE = 128, 0.06
+PLACE = np.array([0.0, 0.3, 0.1])  # of the goal from the handle, metres
+PERCENTILES = (0, 10, 50, 90, 100)
+
+
+def pair_problem(model: tdf.Model, index: int):
+    """Field, reference and settings of a pair of unseen mugs; pairs take turns with the paper's shapes."""
+    case = mug_case(0, index)
+    pick = case.T_world_place_a
+    shape = list(SHAPES.values())[index % len(SHAPES)]
+    path = shape(7, pick[:3, 3], pick[:3, 3] + PLACE, rotation=pick[:3, :3])
+    query = tdf.box_query(jax.random.key(index), QUERIES, QUERY_SIZE)
+    reference = tdf.describe(model, tdf.Demonstration(case.points_a, path, query))
+    field = tdf.encode(model, case.points_b)
+    return field, reference, {"goal": default_goal(field, reference), "energy": tdf.EnergyWeights()}, tdf.OptimizeConfig()
+
+
+def row_problem(model: tdf.Model, index: int):
+    """The same of a row of table 1."""
+    shape, displacement = list(PAPER)[index]
+    setting = settings.Setting(trajectory=shape, displacement=displacement, inits=10, queries=QUERIES)
+    scene = settings.scene(setting)
+    reference = settings.aim(setting, tdf.describe(model, scene.demonstration))
+    field = tdf.encode(model, scene.points)
+    return field, reference, {"goal": settings.goal(setting, field, reference), "energy": setting.energy}, setting.optimiser
+
+
+def compare(model: tdf.Model, problem, seed: int) -> dict:
+    """Energies and seconds of Adam, ten starts and 100 steps, and of the solver, with one key."""
+    field, reference, where, config = problem
+    found = {}
+    for name, minimise, chosen in (
+        ("adam", tdf.optimize, config),
+        ("solve", tdf.solve, tdf.SolveConfig(start=config.start, start_radius=config.start_radius)),
+    ):
+        begin = time.perf_counter()
+        energy = minimise(field, reference, jax.random.key(seed), config=chosen, **where).loss
+        found[name] = {"energy": energy, "seconds": time.perf_counter() - begin}
+    return found
+
+
+def told(found: dict[str, dict]) -> str:
+    """How the ratios of energies, solver over Adam, are distributed."""
+    lines = []
+    for kind in ("row", "pair"):
+        ratios = [one["solve"]["energy"] / one["adam"]["energy"] for name, one in found.items() if name.startswith(kind)]
+        if ratios:
+            spread = ", ".join(f"{percent} %: {value:.4f}" for percent, value in zip(PERCENTILES, np.percentile(ratios, PERCENTILES)))
+            lines.append(f"{len(ratios)} {kind}s, energy of solve over Adam's: mean {np.mean(ratios):.4f}; {spread}")
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compare what is missing in the file, and tell; 2 for a user's mistake."""
+    parser = argparse.ArgumentParser(prog="python -m bench.energies", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pairs", type=int, default=50, help="how many (default: 50)")
+    parser.add_argument("--first", type=int, default=0, help="number of the first pair (default: 0)")
+    parser.add_argument("--rows", type=int, default=len(PAPER), help="of table 1, at most 9 (default: 9)")
+    parser.add_argument("--seed", type=int, default=0, help="of the starts (default: 0)")
+    parser.add_argument("--out", type=Path, default=Path("energies.json"), help="file to keep and go on with (default: energies.json)")
+    options = parser.parse_args(arguments)
+    try:
+        found = json.loads(options.out.read_text()) if options.out.exists() else {}
+        model = tdf.load_model("mug")
+        wanted = [("row", row_problem, index) for index in range(min(options.rows, len(PAPER)))]
+        wanted += [("pair", pair_problem, index) for index in range(options.first, options.first + options.pairs)]
+        for kind, make, index in wanted:
+            name = f"{kind} {index}, seed {options.seed}"
+            if name not in found:
+                found[name] = compare(model, make(model, index), options.seed)
+                replace_file("bench.energies", options.out, (json.dumps(found, indent=1) + "\n").encode())
+                print(name, {method: f"{one['energy']:.5f} in {one['seconds']:.1f} s" for method, one in found[name].items()}, file=sys.stderr)
+    except (InputError, json.JSONDecodeError) as error:
+        print(f"bench.energies: error: {error}", file=sys.stderr)
+        return 2
+    print(told(found))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
