@@ -50,7 +50,7 @@ def row_problem(model: tdf.Model, index: int):
 
 
 def compare(model: tdf.Model, problem, seed: int) -> dict:
-    """Energies and seconds of Adam, ten starts and 100 steps, and of the solver, with one key."""
+    """Energies and seconds, of the first problem with compiling, of Adam, ten starts and 100 steps, and of the solver, with one key."""
     field, reference, where, config = problem
     found = {}
     for name, minimise, chosen in (
@@ -81,15 +81,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--first", type=int, default=0, help="number of the first pair (default: 0)")
     parser.add_argument("--rows", type=int, default=len(PAPER), help="of table 1, at most 9 (default: 9)")
     parser.add_argument("--seed", type=int, default=0, help="of the starts (default: 0)")
-    parser.add_argument("--out", type=Path, default=Path("energies.json"), help="file to keep and go on with (default: energies.json)")
+    parser.add_argument("--out", type=Path, default=Path("runs/energies.json"), help="file to keep and go on with (default: runs/energies.json)")
     options = parser.parse_args(arguments)
     try:
         found = json.loads(options.out.read_text()) if options.out.exists() else {}
+        options.out.parent.mkdir(parents=True, exist_ok=True)
         model = tdf.load_model("mug")
         wanted = [("row", row_problem, index) for index in range(min(options.rows, len(PAPER)))]
         wanted += [("pair", pair_problem, index) for index in range(options.first, options.first + options.pairs)]
-        for kind, make, index in wanted:
-            name = f"{kind} {index}, seed {options.seed}"
+        names = [f"{kind} {index}, seed {options.seed}" for kind, _, index in wanted]
+        for name, (_, make, index) in zip(names, wanted):
             if name not in found:
                 found[name] = compare(model, make(model, index), options.seed)
                 replace_file("bench.energies", options.out, (json.dumps(found, indent=1) + "\n").encode())
@@ -97,7 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (InputError, json.JSONDecodeError) as error:
         print(f"bench.energies: error: {error}", file=sys.stderr)
         return 2
-    print(told(found))
+    print(told({name: found[name] for name in names}))
     return 0
 
 

@@ -40,7 +40,7 @@ class Problem(NamedTuple):
 
 
 @functools.partial(jax.jit, compiler_options=devices.ONCE)
-def problem(reference: Reference, order: Int[Array, "blocks size"], counts: Bool[Array, "blocks size"]) -> Problem:
+def in_blocks(reference: Reference, order: Int[Array, "blocks size"], counts: Bool[Array, "blocks size"]) -> Problem:
     """A reference's query points in blocks.
 
     Args:
@@ -77,11 +77,11 @@ def descend(R, place, waypoint, bounds, damping, tolerance, field, problem, ener
     """Damped Gauss-Newton steps, until none promises to gain by the tolerance.
 
     Args:
-        R, place: poses, see `Candidates`.
+        R, place: rotations of the query frame in the world, (poses, 3, 3), and places of the query points' mean, (poses, 3), metres.
         waypoint: of each pose, what it is to match.
         bounds: how many of the poses move, how many are evaluated, blocks of query points, most steps.
         damping: of the first step.
-        tolerance: see `SolveConfig`.
+        tolerance: share of a pose's energy that its next step has to promise; where none does, all end.
         field, problem, energy: what is minimised.
         length: times a history has room for.
         chunk: query points evaluated at a time.

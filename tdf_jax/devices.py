@@ -1,10 +1,12 @@
-"""Work shared among the devices of a mesh, in one process or several: each takes a part of the starts, and only results are exchanged."""
+"""Work shared among the devices of a mesh, in one process or several: each takes a part of the starts or of a grid, and only results are exchanged."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from tdf_jax.errors import InputError
 
 WHOLE = PartitionSpec()
 # Descriptors held at a time on an accelerator: 134 MB, and as much again for every tangent. An estimate: enough to fill it, few enough for its memory.
@@ -16,6 +18,12 @@ ONCE = {"xla_backend_optimization_level": 0}  # for programs that run once a cal
 def points_at_a_time(cpu_points: int) -> int:
     """How many query points to evaluate at a time: a CPU wants them in its cache, an accelerator wants many."""
     return cpu_points if jax.default_backend() == "cpu" else ACCELERATOR_POINTS
+
+
+def check_mesh(function: str, mesh) -> None:
+    """Raise InputError unless it is a mesh, or None."""
+    if mesh is not None and not isinstance(mesh, Mesh):
+        raise InputError(f"{function}: mesh is {mesh!r}; expected a jax.sharding.Mesh, such as jax.make_mesh((2,), ('devices',))")
 
 
 def alone() -> Mesh:

@@ -52,14 +52,14 @@ def imitate(
         InputError: bad points, goal, offset or settings.
     """
     check_key("imitate()", key)
+    if not isinstance(config, SolveConfig | OptimizeConfig):
+        raise InputError(f"imitate(): config is {config!r}; expected a SolveConfig or an OptimizeConfig")
     reference = demonstration if isinstance(demonstration, Reference) else describe(model, demonstration)
     field = encode(model, points)
     goal = None if goal is None else _finite("goal", goal, (7,))
     if goal_offset is not None:
         goal = default_goal(field, reference) if goal is None else goal
         goal = goal + jnp.pad(_finite("goal_offset", goal_offset, (3,)), (4, 0))
-    if not isinstance(config, SolveConfig | OptimizeConfig):
-        raise InputError(f"imitate(): config is {config!r}; expected a SolveConfig or an OptimizeConfig")
     minimise = optimize if isinstance(config, OptimizeConfig) else solve
     return minimise(field, reference, key, goal=goal, fix_last=fix_last, energy=energy, config=config, progress=progress, mesh=mesh)
 

@@ -89,24 +89,25 @@ def encode(model: Model, points: Float[Array, "points 3"], thinnings: int = THIN
         in thinning that rounding decides.
 
     Raises:
-        InputError: the points are fewer than 21, not (points, 3), not finite or all equal; thinnings is negative, or the points would
+        InputError: the points are fewer than 21 or than the network's neighbours, not (points, 3), not finite or all equal; thinnings is negative, or the points would
             be thinned under `jax.jit`.
     """
     points, count = check_points(points), model.info.cloud_points
     if not isinstance(thinnings, int | np.integer) or thinnings < 0:
         raise InputError(f"encode(): thinnings is {thinnings}; expected a whole number of 0 or more")
+    if len(points) < model.config.neighbours:
+        raise InputError(f"encode(): there are {len(points)} points; expected at least the network's {model.config.neighbours} neighbours")
     plain = not thinnings or count is None
     dense = not plain and len(points) > count
-    if isinstance(points, jax.core.Tracer):
-        if dense:
-            raise InputError(
-                f"encode(): {len(points)} points cannot be thinned to {count} under jax.jit; expected that many. "
-                "Thin the cloud outside with tdf.thin, or pass thinnings=0"
-            )
-        # Not by the loop below, which has no reverse-mode derivative.
-        latent, origin = _latent(model.params, model.config, points)
-        return DescriptorField(condition(model.params, model.config, latent), origin)
-    clouds = pointcloud.thinnings(np.asarray(points), count, thinnings) if dense else np.asarray(points)[None]
+    traced = isinstance(points, jax.core.Tracer)
+    if traced and dense:
+        raise InputError(
+            f"encode(): {len(points)} points cannot be thinned to {count} under jax.jit; expected that many. "
+            "Thin the cloud outside with tdf.thin, or pass thinnings=0"
+        )
+    clouds = pointcloud.thinnings(np.asarray(points), count, thinnings) if dense else points[None]
+    if traced or any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(model.params)):
+        return _average(model.params, model.config, clouds)
     several, size = clouds.shape[:2]
     # Filled up with clouds and points that do not count: clouds of many sizes run one program.
     room = (1, -(-size // ROOM) * ROOM) if plain else (thinnings, count)
@@ -125,6 +126,13 @@ def _encode(params, config, clouds, several, size):
     sums = jnp.zeros((config.latent, 3), dtype), jnp.zeros(3, clouds.dtype)
     latent, origin = (part / several for part in jax.lax.fori_loop(0, several, add, sums))
     return DescriptorField(condition(params, config, latent), origin)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _average(params, config, clouds):
+    """The same of all points of all clouds, without a loop of unknown length, which has no reverse-mode derivative."""
+    latents, origins = jax.lax.map(lambda points: _latent(params, config, points), clouds)
+    return DescriptorField(condition(params, config, jnp.mean(latents, axis=0)), jnp.mean(origins, axis=0))
 
 
 def _latent(params, config, points, used=None):

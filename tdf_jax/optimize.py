@@ -160,7 +160,8 @@ def optimize(
         All starts' results.
 
     Raises:
-        InputError: starts, goal or weights of a wrong shape or value, or a reference from another network than the field.
+        InputError: starts, goal, weights or mesh of a wrong shape, type or value, a reference from another network than the field, or nothing to
+            move: one pose, and that kept.
     """
     starts, energy = prepare("optimize()", field, reference, key, goal, fix_last, energy, config, starts, mesh)
     inits, dtype = len(starts), starts.dtype
@@ -205,12 +206,13 @@ def prepare(
         config: with `inits`, `start` and `start_radius`.
 
     Raises:
-        InputError: starts, goal or weights of a wrong shape, type or value, or a reference from another network than the field.
+        InputError: as for `optimize`.
     """
     if not isinstance(energy, EnergyWeights):
         raise InputError(f"{function}: energy is {energy!r}; expected EnergyWeights, such as EnergyWeights(correlation=0.02)")
-    if mesh is not None and not isinstance(mesh, jax.sharding.Mesh):
-        raise InputError(f"{function}: mesh is {mesh!r}; expected a jax.sharding.Mesh, such as jax.make_mesh((2,), ('starts',))")
+    devices.check_mesh(function, mesh)
+    if fix_last and reference.trajectory.poses == 1:
+        raise InputError(f"{function}: the trajectory has one pose and fix_last keeps it; expected fix_last=False")
     channels = field.conditioned.config.channels
     if reference.descriptors.shape[-1] != channels:
         raise InputError(

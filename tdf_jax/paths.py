@@ -10,6 +10,9 @@ from tdf_jax.errors import InputError
 from tdf_jax.trajectory import Trajectory, check_count, check_rotations, checked_vector, resample
 
 
+UPRIGHT = 0.6  # of the way across, before `tilt_and_pour` tilts
+
+
 def line(
     poses: int = 7,
     start: ArrayLike = (0.0, 0.0, 0.0),
@@ -153,7 +156,7 @@ def tilt_and_pour(
     Args:
         poses, start, end, rotation: As for `line`.
         height: Metres above start and end at which it goes across.
-        tilt: Radians that it is tilted at the end, about the horizontal axis across the way.
+        tilt: Radians that it is tilted at the end, less than half a turn, about the horizontal axis across the way.
         up: Direction of the lift.
 
     Returns:
@@ -167,7 +170,9 @@ def tilt_and_pour(
     lift, across = _positive("tilt_and_pour", "height", height) * up, np.cross(up, end - start)
     if not np.linalg.norm(across) > 1e-6 * np.linalg.norm(end - start):
         raise InputError(f"tilt_and_pour(): up {up.tolist()} is along the way from start to end; expected a way aside.")
-    turn = se3.exp(jnp.asarray(_positive("tilt_and_pour", "tilt", tilt) * across / np.linalg.norm(across)))
+    if _positive("tilt_and_pour", "tilt", tilt) >= np.pi:  # turns go the shortest way
+        raise InputError(f"tilt_and_pour(): tilt is {tilt}; expected radians, less than pi.")
+    turn = se3.exp(jnp.asarray(tilt * across / np.linalg.norm(across)))
     upright = start + lift + UPRIGHT * (end - start)
     return _through("tilt_and_pour", poses, [start, start + lift, upright, end], [R_start, R_start, R_start, turn @ R_start])
 
@@ -186,25 +191,24 @@ def hang_on_rack(
     Args:
         poses, start, end, rotation: As for `line`.
         approach: The last straight part, from the peg's front to the end, metres.
-        end_rotation: Orientation on the peg; by default a quarter turn about the approach.
+        end_rotation: Orientation on the peg; by default `rotation` after a quarter turn about the approach.
 
     Returns:
         The trajectory.
 
     Raises:
-        InputError: If an argument has a wrong shape or value, start and end are the same place, or the approach begins at the start.
+        InputError: If an argument has a wrong shape or value, start and end are the same place, or the approach is zero or all of the way.
     """
     start, end, R_start, R_end = _ends("hang_on_rack", start, end, rotation, end_rotation)
     approach = checked_vector("hang_on_rack", "approach", approach)
     front = end - approach
     if not (approach.any() and np.linalg.norm(front - start) > 0):
-        raise InputError(f"hang_on_rack(): approach is {approach.tolist()}; expected a part of the way that is not all of it.")
+        raise InputError(f"hang_on_rack(): approach is {approach.tolist()}; expected a vector that is not zero and not the whole way from start to end.")
     if end_rotation is None:
         R_end = se3.exp(jnp.asarray(np.pi / 2 * approach / np.linalg.norm(approach))) @ R_start
     return _through("hang_on_rack", poses, [start, front, end], [R_start, R_end, R_end])
 
 
-UPRIGHT = 0.6  # of the way across, before `tilt_and_pour` tilts
 SHAPES = {"line": line, "semicircle": semicircle, "wave": wave}  # the paper's
 PATHS = SHAPES | {"lift_over": lift_over, "tilt_and_pour": tilt_and_pour, "hang_on_rack": hang_on_rack}
 
@@ -223,9 +227,9 @@ def _ends(function, start, end, rotation, end_rotation):
     return start, end, R_start, R_start if end_rotation is None else _rotation(function, end_rotation)
 
 
-def _positive(function, name, value) -> float:
+def _positive(function, name, value, expected="one number above 0.") -> float:
     if not (np.ndim(value) == 0 and np.isfinite(value) and value > 0):
-        raise InputError(f"{function}(): {name} is {value}; expected one number above 0.")
+        raise InputError(f"{function}(): {name} is {value}; expected {expected}")
     return float(value)
 
 
@@ -253,8 +257,8 @@ def _trajectory(function, poses, start, end, rotation, end_rotation, curve, heig
     check_count(function, poses)
     start, end, R_start, R_end = _ends(function, start, end, rotation, end_rotation)
     chord = np.linalg.norm(end - start)
-    if height is not None and not (np.isfinite(height) and height > 0):
-        raise InputError(f"{function}(): height is {height}; expected metres above 0. Turn bulge for the other side.")
+    if height is not None:
+        _positive(function, "height", height, "metres above 0. Turn bulge for the other side.")
     forward, side = (end - start) / chord, np.zeros(3)
     if bulge is not None:
         bulge = checked_vector(function, "bulge", bulge)

@@ -1,4 +1,4 @@
-"""Refinement of a field's shape: the latent is moved until the object's points lie on the surface of occupancy 0.5."""
+"""Refinement of a field's shape: the latent is moved so that the object's points come nearer to the surface of occupancy 0.5."""
 
 import functools
 
@@ -19,11 +19,11 @@ DECAYS = 0.9, 0.999  # of the moments, Adam's
 
 
 def refine(model: Model, field: DescriptorField, points: Float[Array, "points 3"], steps: int = 40) -> DescriptorField:
-    """Move a field's latent so that the points of its object lie on its surface.
+    """Move a field's latent so that the points of its object come to its surface.
 
     The encoder sees a few hundred of an object's points at a time and knows its surface from them to a few millimetres. The mean of
     (occupancy - 1/2)^2 over up to 1500 points, lowered by gradient steps on the latent with the network as it is, adds what the others say.
-    It is for shapes: reconstruction, clearance. Descriptors change little by it, and poses found with them hardly (docs/evaluation.md).
+    It is for shapes: reconstruction, clearance. Poses found with a refined field are hardly other ones (docs/evaluation.md). It has no reverse-mode derivative.
 
     Args:
         model: the network that encoded the field.
@@ -35,7 +35,7 @@ def refine(model: Model, field: DescriptorField, points: Float[Array, "points 3"
         The field, its origin unchanged; it turns with the points as the field that came in does.
 
     Raises:
-        InputError: the points are not as for `encode`, or traced by `jax.jit`; steps is negative; the field is another network's.
+        InputError: the points are not as for `encode`, or traced by `jax.jit`; steps is negative; the field is that of a network of other sizes.
 
     Source:
         Steps are VectorAdam's, of one length for the three numbers of a vector, so that they turn with the cloud: Ling, Sharp and Jacobson,

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from tdf_jax import descent, devices, poses
 from tdf_jax.demonstration import Reference
@@ -136,8 +136,6 @@ def solve(
         )
     n = starts.shape[1]
     free = n - 1 if fix_last else n
-    if free == 0:
-        raise InputError("solve(): the trajectory has one pose and fix_last keeps it; expected fix_last=False")
     if not (starts[:, free:] == starts[:1, free:]).all():
         raise InputError("solve(): the last poses of the starts differ and fix_last keeps them; expected one, or a goal")
 
@@ -198,9 +196,9 @@ def _problem(key, reference, size):
     count = len(reference.query)
     # A stream of its own: start m is drawn from fold_in(key, m).
     shuffled = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel()).permutation(count)
-    blocks = -(-count // size), size
+    shape = -(-count // size), size
     # What fills up the last block is any point, and does not count.
-    return descent.problem(reference, np.resize(shuffled, blocks), (np.arange(np.prod(blocks)) < count).reshape(blocks))
+    return descent.in_blocks(reference, np.resize(shuffled, shape), (np.arange(np.prod(shape)) < count).reshape(shape))
 
 
 def _candidates(wxyz_xyz, problem):

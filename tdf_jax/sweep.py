@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from tdf_jax import lattice, poses
 from tdf_jax.demonstration import Reference
+from tdf_jax.devices import check_mesh
 from tdf_jax.errors import InputError
 from tdf_jax.field import DescriptorField
 from tdf_jax.grid import Grid
@@ -51,7 +52,7 @@ def energy_landscape(
         progress: called with the number of tiles done and of all.
 
     Raises:
-        InputError: rotations that are none, an unknown choice, or a reference from another network than the field.
+        InputError: rotations that are none, an unknown choice, a mesh of another type, or a reference from another network than the field.
     """
     landscape = blank(field, reference, grid, rotation, reduce, over_rotations=over_rotations, temperature=temperature)
     for done, total in fill(landscape, field, reference, share=share, mesh=mesh):
@@ -114,6 +115,7 @@ def fill(
     Yields:
         The number of parts done and of all: tiles of the grid, one rotation after the other.
     """
+    check_mesh("energy_landscape()", mesh)
     grid, query = landscape.grid, np.asarray(reference.query, dtype=float)
     found = [lattice.layers(grid, query @ R.T, share) for R in landscape.rotations]
     cover = [lattice.tiles(grid, each.span) for each in found]

@@ -109,7 +109,7 @@ def check_trajectory(trajectory: Trajectory, name: str = "trajectory") -> Trajec
         The same trajectory.
 
     Raises:
-        InputError: If the shape is not (poses, 7) with at least 2 poses, a number is not finite, or a quaternion
+        InputError: If the shape is not (poses, 7) with at least one pose, a number is not finite, or a quaternion
             has length zero.
     """
     wxyz_xyz = trajectory.wxyz_xyz
@@ -119,8 +119,8 @@ def check_trajectory(trajectory: Trajectory, name: str = "trajectory") -> Trajec
         raise InputError(f"check_trajectory(): {name}.wxyz_xyz has shape {wxyz_xyz.shape}; expected (poses, 7).")
     if not jnp.issubdtype(wxyz_xyz.dtype, jnp.floating):
         raise InputError(f"check_trajectory(): {name} has dtype {wxyz_xyz.dtype}; expected floating point.")
-    if len(wxyz_xyz) < 2:
-        raise InputError(f"check_trajectory(): {name} has {len(wxyz_xyz)} poses; expected at least 2, pick and place.")
+    if not len(wxyz_xyz):
+        raise InputError(f"check_trajectory(): {name} has no pose; expected at least one.")
     if not isinstance(wxyz_xyz, jax.core.Tracer):
         values = np.asarray(wxyz_xyz)
         finite = np.isfinite(values).all(axis=1)
@@ -149,10 +149,11 @@ def resample(trajectory: Trajectory, poses: int) -> Trajectory:
         The resampled trajectory; its ends are those of the original.
 
     Raises:
-        InputError: If poses is below 2 or the trajectory fails `check_trajectory`.
+        InputError: If poses is below 2, the trajectory has one pose, or it fails `check_trajectory`.
     """
     check_count("resample", poses)
-    check_trajectory(trajectory)
+    if check_trajectory(trajectory).poses < 2:
+        raise InputError("resample(): the trajectory has one pose; expected at least 2, a way between.")
     R, t = trajectory.rotations, trajectory.translations
     steps = jnp.linalg.norm(jnp.diff(t, axis=0), axis=1)
     steps = jnp.where(steps.sum() > 0, steps, 1.0)

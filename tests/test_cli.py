@@ -16,6 +16,7 @@ from tdf_jax.cli import main as command_line, report, scene
 from tdf_jax.cli.main import main
 from tdf_jax.cli.settings import Settings
 from tdf_jax.evaluation.truth import pose_error
+from tdf_jax.paths import PATHS
 from tdf_jax.recording import save_demonstration
 from tdf_jax.shapes import build_mug
 
@@ -251,7 +252,13 @@ def test_a_drawn_mesh_lies_where_its_points_do(tmp_path):
             assert (points >= mesh.bounds[0] - 1e-6).all() and (points <= mesh.bounds[1] + 1e-6).all()
 
 
-@pytest.mark.parametrize("shape", ["line", "semicircle", "wave"])
+def test_every_path_can_be_named():
+    annotation = typing.get_type_hints(Settings)["trajectory"]
+    (choices,) = (typing.get_args(one) for one in typing.get_args(annotation) if one is not type(None))
+    assert choices == tuple(PATHS)
+
+
+@pytest.mark.parametrize("shape", PATHS)
 def test_generated_demonstrations_go_from_the_handle_to_the_place(shape):
     settings = Settings(trajectory=shape, poses=5, queries=7, target_pose="given")
     made = scene.make_scene(settings, jax.random.key(0))

@@ -53,9 +53,9 @@ def test_clouds_are_thinned_to_the_networks_density(small_model, demonstration, 
     model = dataclasses.replace(small_model, info=tdf.ModelInfo("small", "random numbers", cloud_points=40))
     found = tdf.describe(model, dataclasses.replace(demonstration, points=dense))
     expected = tdf.describe(small_model, dataclasses.replace(demonstration, points=thin(dense, 40)))
-    np.testing.assert_array_equal(found.descriptors, expected.descriptors)
+    np.testing.assert_allclose(found.descriptors, expected.descriptors, atol=1e-6)
     sparse = tdf.describe(model, demonstration)  # no more points than that: all are used
-    np.testing.assert_array_equal(sparse.descriptors, reference.descriptors)
+    np.testing.assert_allclose(sparse.descriptors, reference.descriptors, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_clouds_are_thinned_to_the_networks_density(small_model, demonstration, 
         ({"points": np.full((40, 3), np.nan)}, "NaN or infinite"),
         ({"trajectory": np.zeros((4, 7))}, "trajectory is a ndarray; expected a Trajectory"),
         ({"trajectory": tdf.Trajectory(jnp.zeros((4, 7)))}, "quaternion"),
-        ({"trajectory": tdf.Trajectory(jnp.ones((1, 7)))}, "at least 2"),
+        ({"trajectory": tdf.Trajectory(jnp.ones((0, 7)))}, "no pose"),
         ({"query": np.zeros((8, 2))}, r"Demonstration\(\): query points have shape \(8, 2\)"),
         ({"query": np.zeros((0, 3))}, r"expected \(queries, 3\)"),
         ({"query": np.full((8, 3), np.inf)}, "finite metres"),

@@ -12,14 +12,13 @@ import tdf_jax as tdf
 from tdf_jax import poses
 from tdf_jax.errors import InputError
 from tdf_jax.evaluation.annotated import AnnotatedMesh
-from tdf_jax.evaluation.cases import mesh_case, mug_case, random_pose
+from tdf_jax.evaluation.cases import mesh_case, mug_case
 from tdf_jax.evaluation.clouds import CONDITIONS, NOISE
 from tdf_jax.evaluation.comparison import BASELINES, compare, random_weights
 from tdf_jax.evaluation.summary import summary
 from tdf_jax.evaluation.transfer import QUERY_SIZE, overlaps, place_errors, transferred
 from tdf_jax.evaluation.truth import expected_trajectory, path_error, pose_error
 from tdf_jax.meshes import sample_surface
-from tdf_jax.optimize import random_starts
 
 from conftest import compilations
 
@@ -195,6 +194,11 @@ def test_every_case_and_network_runs_the_programs_of_the_first(small_model):
         for cases in batches[1:]:
             compare(cases, model, BASELINES, config=config, progress=False)
     assert names == []
+
+
+def test_an_unknown_baseline_is_told_before_anything_runs():
+    with pytest.raises(InputError, match=r"compare\(\): baselines has 'RANSAC'; expected some of random weights, PCA, ICP"):
+        compare([], None, ("ICP", "RANSAC"))
 
 
 def test_the_shipped_weights_transfer_a_pose_and_random_ones_do_not():

@@ -170,6 +170,25 @@ def test_clouds_of_many_sizes_run_one_program_and_what_fills_them_up_does_not_co
         np.testing.assert_allclose(traced.latent, field.latent, atol=2e-6 * np.abs(plain).max())
 
 
+@pytest.mark.parametrize("model", ["small_model", "thinning_model"])
+def test_the_latent_has_a_gradient_with_respect_to_the_parameters(model, request):
+    model, cloud = request.getfixturevalue(model), random_cloud(0, 90).astype(np.float32)
+
+    def size(model):
+        return jnp.sum(tdf.encode(model, cloud, thinnings=3).latent ** 2)
+
+    kernel = model.params["encoder"]["fc_c"]["map_to_feat"]["kernel"]
+    slope = jax.grad(size)(model).params["encoder"]["fc_c"]["map_to_feat"]["kernel"]
+    # The latent is linear in its last map, so its square grows by twice its size along it.
+    assert float(jnp.sum(slope * kernel)) == pytest.approx(2 * float(size(model)), rel=1e-4)
+
+
+def test_more_neighbours_than_points_are_refused(small_model):
+    model = dataclasses.replace(small_model, config=dataclasses.replace(small_model.config, neighbours=30))
+    with pytest.raises(InputError, match="25 points; expected at least the network's 30 neighbours"):
+        tdf.encode(model, random_cloud(0, 25))
+
+
 def test_a_cloud_hardly_denser_is_thinned_once():
     points = random_cloud(0, 60)
     assert len(thinnings(points, 24, 8)) == 1

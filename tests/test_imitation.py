@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import compilations, random_cloud, random_poses
@@ -123,6 +122,16 @@ def test_progress_is_passed_on(imitate, reference):
 def test_bad_input_is_refused(imitate, reference, settings, message):
     with pytest.raises(InputError, match=message):
         imitate(reference, **settings)
+
+
+@pytest.mark.parametrize("config", [CONFIG, tdf.SolveConfig(inits=3, scouts=3, points=8, steps=(2, 2, 2, 2, 2, 2))])
+def test_a_demonstration_of_one_pose_is_found_where_it_is_free(imitate, demonstration, config):
+    one = dataclasses.replace(demonstration, trajectory=tdf.Trajectory(demonstration.trajectory.wxyz_xyz[:1]))
+    for inits in (3, 1):
+        result = imitate(one, fix_last=False, config=dataclasses.replace(config, inits=inits))
+        assert result.trajectory.poses == 1 and np.isfinite(result.energies).all()
+    with pytest.raises(InputError, match="one pose and fix_last keeps it; expected fix_last=False"):
+        imitate(one, config=config)
 
 
 def test_what_is_no_demonstration_is_refused(small_model):

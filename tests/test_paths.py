@@ -97,7 +97,7 @@ def test_paths_refuse_bad_arguments(path):
 
 @pytest.mark.parametrize("path", [semicircle, wave])
 def test_curved_paths_refuse_bad_heights_and_bulges(path):
-    for height in (0, -0.1, np.nan, np.inf):
+    for height in (0, -0.1, np.nan, np.inf, (1, 2)):
         with pytest.raises(InputError, match="height is .*; expected metres above 0"):
             path(height=height)
     for bulge in ((0, 1, 0), (0, -2, 0), (0, 0, 0)):
@@ -158,8 +158,9 @@ def test_lifts_pours_and_racks_refuse_what_has_no_meaning():
         lift_over(up=(0, 0, 0))
     with pytest.raises(InputError, match="along the way from start to end"):
         tilt_and_pour(up=(0, -2, 0))
-    with pytest.raises(InputError, match=r"tilt_and_pour\(\): tilt is 0"):
-        tilt_and_pour(tilt=0)
+    for tilt in (0, np.pi, 90):
+        with pytest.raises(InputError, match=rf"tilt_and_pour\(\): tilt is {tilt}"):
+            tilt_and_pour(tilt=tilt)
     for approach in ((0, 0, 0), (0, 0.3, 0)):
-        with pytest.raises(InputError, match=r"hang_on_rack\(\): approach is .*a part of the way"):
+        with pytest.raises(InputError, match=r"hang_on_rack\(\): approach is .*not the whole way"):
             hang_on_rack(approach=approach)

@@ -248,7 +248,7 @@ def test_stages_and_what_is_traced_share_one_program(small_model, field, referen
         for weight in (0, 0.5, jnp.array(0.1)):
             run(other, reference, key=jax.random.key(5), energy=tdf.EnergyWeights(correlation=weight, lever=weight))
         run(field, reference, config=dataclasses.replace(CONFIG, tolerance=0.1))
-    assert not {"jit(descend)", "jit(_random_starts)"} & set(compiled)
+    assert not {"jit(descend)", "jit(in_blocks)", "jit(_random_starts)"} & set(compiled)
 
 
 # ---- bad input ----

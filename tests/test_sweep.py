@@ -172,6 +172,8 @@ def test_what_does_not_fit_is_refused(field, reference):
     for matrix in (2 * np.eye(3), np.diag([1.0, 1.0, -1.0])):
         with pytest.raises(InputError, match="no rotations"):
             energy_landscape(field, reference, grid, matrix)
+    with pytest.raises(InputError, match=r"energy_landscape\(\): mesh is .*expected a jax.sharding.Mesh"):
+        energy_landscape(field, reference, grid, mesh=jax.devices())
     with pytest.raises(InputError, match="over_rotations is 'all'"):
         energy_landscape(field, reference, grid, over_rotations="all")
     with pytest.raises(InputError, match="reduce is 'min'"):

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from tdf_jax.errors import InputError
-from tdf_jax.paths import line, semicircle, wave
+from tdf_jax.paths import line, wave
 from tdf_jax.trajectory import Trajectory, check_trajectory, displace, load_trajectory, resample, save_trajectory
 
 IDENTITY = np.array([1, 0, 0, 0, 0, 0, 0], np.float32)
@@ -119,8 +119,7 @@ def broken(row, column, value):
 BAD_POSES = {
     r"has shape \(3, 6\); expected \(poses, 7\)": np.zeros((3, 6), np.float32),
     r"has shape \(7,\)": IDENTITY,
-    "has 1 poses; expected at least 2": IDENTITY[None],
-    "has 0 poses": np.zeros((0, 7), np.float32),
+    "has no pose; expected at least one": np.zeros((0, 7), np.float32),
     "pose 1 of path is NaN or infinite": broken(1, 5, np.nan),
     "pose 2 of path is NaN or infinite": broken(2, 0, np.inf),
     "the quaternion of pose 1 of path has length 0.0e": broken(1, 0, 0),
@@ -150,8 +149,8 @@ def test_broken_trajectories_are_refused_where_they_are_used(tmp_path):
 def test_check_trajectory_inside_jit_checks_the_shape():
     with jax.debug_nans(False):
         assert jax.jit(lambda x: check_trajectory(Trajectory(x)))(broken(1, 5, np.nan)).poses == 3
-    with pytest.raises(InputError, match="has 1 poses"):
-        jax.jit(lambda x: check_trajectory(Trajectory(x)))(IDENTITY[None])
+    with pytest.raises(InputError, match="has no pose"):
+        jax.jit(lambda x: check_trajectory(Trajectory(x)))(IDENTITY[:0].reshape(0, 7))
 
 
 def test_from_matrices_refuses_what_is_not_rigid():
@@ -169,8 +168,9 @@ def test_from_matrices_refuses_what_is_not_rigid():
     for bad in (T[:, :3], T[0], np.zeros((3, 7))):
         with pytest.raises(InputError, match=r"have shape .*; expected \(poses, 4, 4\)"):
             Trajectory.from_matrices(bad)
-    with pytest.raises(InputError, match="has 1 poses"):
-        Trajectory.from_matrices(T[:1])
+    assert Trajectory.from_matrices(T[:1]).poses == 1
+    with pytest.raises(InputError, match="the trajectory has one pose; expected at least 2"):
+        resample(Trajectory.from_matrices(T[:1]), 3)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -212,7 +212,7 @@ DAMAGED = {
     "words.tum": b"a b c d e f g h\n" * 3,
     "ragged.tum": b"0 1 2 3 0 0 0 1\n1 2 3\n",
     "binary.tum": b"\xff\xfe\x00",
-    "one.tum": b"0 1 2 3 0 0 0 1\n",
+    "none.tum": b"# no pose\n",
     "nan.tum": b"0 1 2 3 0 0 0 1\n1 nan 2 3 0 0 0 1\n",
     "zero.tum": b"0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 0\n",
 }

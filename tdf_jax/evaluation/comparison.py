@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from tdf_jax.errors import InputError
 from tdf_jax.evaluation.baselines import METHODS, aligned
 from tdf_jax.evaluation.cases import Case
 from tdf_jax.evaluation.summary import summary
@@ -60,7 +61,13 @@ def compare(
         seed: of query points, starts and the bootstrap.
         config: settings of the optimiser.
         progress: show progress bars.
+
+    Raises:
+        InputError: there is no such baseline.
     """
+    for method in baselines:
+        if method not in BASELINES:
+            raise InputError(f"compare(): baselines has {method!r}; expected some of {', '.join(BASELINES)}")
     found = transferred(model, cases, seed=seed, config=config, progress=progress)
     outcomes = [_outcome(model.info.name, cases, found, overlaps(model, cases), seed)]
     for method in baselines:
