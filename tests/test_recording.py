@@ -44,7 +44,7 @@ def test_any_npz_of_the_three_arrays_will_do(tmp_path, demonstration):
     ("points", np.full((30, 3), np.nan), "NaN"),
     ("points", np.array(["a"] * 30), "dtype"),
     ("points", np.array([{}] * 30), "cannot be read"),
-    ("wxyz_xyz", np.ones((1, 7)), "1 poses"),
+    ("wxyz_xyz", np.ones((0, 7)), "no pose"),
     ("wxyz_xyz", np.ones((4, 6)), r"\(4, 6\)"),
     ("wxyz_xyz", np.zeros((4, 7)), "quaternion"),
     ("query", np.zeros((5, 2)), r"\(5, 2\)"),
