@@ -47,12 +47,14 @@ def original(workers: Workers) -> list[dict]:
 
 
 def energies(workers: Workers, inits: int, poses: int, queries: int) -> list[dict]:
-    """Energies of random starts and their gradients, every competitor against the first."""
+    """Energies of random starts and the gradients of their free poses, every competitor against the first."""
     state, arrays = scene.weights(tdf.load_model("mug")), scene.imitation(inits, poses, queries)
     found = {}
     for name in ("torch", "torch_tuned", "tdf_jax"):
         workers.ask(name, "prepare", {"task": "gradient", "settings": {}, "arrays": arrays, "state": state})
         found[name] = workers.ask(name, "run")["result"]
+    # The fixed last pose lies where eq. 3's norm has its kink: which way its derivative points there is a matter of rounding.
+    found = {name: {kind: part if kind == "energies" else part[:, :-1] for kind, part in result.items()} for name, result in found.items()}
     expected = found.pop("torch")
     return [
         check(f"{kind}, {name} and torch", difference(result[kind], expected[kind]), ENERGIES if kind == "energies" else GRADIENTS)
