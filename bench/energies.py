@@ -95,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 found[name] = compare(model, make(model, index), options.seed)
                 replace_file("bench.energies", options.out, (json.dumps(found, indent=1) + "\n").encode())
                 print(name, {method: f"{one['energy']:.5f} in {one['seconds']:.1f} s" for method, one in found[name].items()}, file=sys.stderr)
-    except (InputError, json.JSONDecodeError) as error:
+    except (InputError, OSError, json.JSONDecodeError) as error:
         print(f"bench.energies: error: {error}", file=sys.stderr)
         return 2
     print(told({name: found[name] for name in names}))

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import compilations, random_cloud, random_poses
+from conftest import compilations, enabled, random_cloud, random_poses
 
 import tdf_jax as tdf
 from tdf_jax import poses, refinement
@@ -70,6 +70,14 @@ def test_clouds_of_all_sizes_and_steps_run_one_program(small_model):
         for field, cloud in zip(fields[1:], clouds[1:]):
             assert np.isfinite(tdf.refine(small_model, field, cloud, 2).latent).all()
     assert "jit(_refine)" not in names
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_numbers_keep_their_precision_where_64_bits_are_enabled(small_model, dtype):
+    with enabled("float64"):
+        points = random_cloud(2, 40).astype(dtype)
+        field = tdf.encode(small_model, points)
+        assert tdf.refine(small_model, field, points, 2).latent.dtype == field.latent.dtype == dtype
 
 
 def test_bad_input_is_refused(small_model):
