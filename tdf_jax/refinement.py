@@ -52,13 +52,12 @@ def refine(model: Model, field: DescriptorField, points: Float[Array, "points 3"
     if len(points) > POINTS:
         points = points[np.random.default_rng(0).permutation(len(points))[:POINTS]]
     weights = (np.arange(POINTS) < len(points)).astype(points.dtype) / len(points)
-    conditioned = _refine(model.params, model.config, field.latent, np.resize(points, (POINTS, 3)) - field.origin, weights, np.int32(steps))
+    conditioned = _refine(model.params, model.config, field.latent, np.resize(points, (POINTS, 3)) - field.origin, weights, steps)
     return DescriptorField(conditioned, field.origin)
 
 
 @functools.partial(jax.jit, static_argnames="config")
 def _refine(params, config, latent, x, weights, steps):
-    count = steps.astype(latent.dtype)
     size = jnp.sqrt(jnp.mean(jnp.sum(latent**2, axis=-1)))
 
     def miss(latent):
@@ -67,12 +66,11 @@ def _refine(params, config, latent, x, weights, steps):
 
     def step(i, state):
         latent, first, second = state
-        done = i.astype(latent.dtype)  # a whole number of 64 bits would make all of this float64
         gradient = jax.grad(miss)(latent)
         first = DECAYS[0] * first + (1 - DECAYS[0]) * gradient
         second = DECAYS[1] * second + (1 - DECAYS[1]) * jnp.sum(gradient**2, axis=-1, keepdims=True)
-        mean, square = first / (1 - DECAYS[0] ** (done + 1)), second / (1 - DECAYS[1] ** (done + 1))
-        rate = RATE * size * 0.5 * (1 + jnp.cos(jnp.pi * done / count))
+        mean, square = first / (1 - DECAYS[0] ** (i + 1)), second / (1 - DECAYS[1] ** (i + 1))
+        rate = RATE * size * 0.5 * (1 + jnp.cos(jnp.pi * i / steps))
         # A vector that the occupancies do not depend on has moments of zero.
         return latent - rate * mean / jnp.maximum(jnp.sqrt(square), 1e-20), first, second
 
