@@ -1,7 +1,10 @@
 """Imitate a demonstrated pick-and-place trajectory on new objects: Trajectory Descriptor Fields in JAX."""
 
+from tdf_jax.carry import CarryConfig, carry, carry_trajectory
 from tdf_jax.checkpoint import available_models, load_model, save_model
 from tdf_jax.convert import convert_checkpoint
+from tdf_jax.clearance import ClearanceConfig, clearance, push_clear
+from tdf_jax.confidence import confidence
 from tdf_jax.demonstration import Demonstration, Reference, describe
 from tdf_jax.descriptor import pose_descriptor, trajectory_descriptor
 from tdf_jax.energy import (
@@ -18,7 +21,9 @@ from tdf_jax.imitation import imitate, imitate_batch
 from tdf_jax.landscape import Landscape, load_landscape, save_landscape
 from tdf_jax.meshes import load_mesh, sample_surface
 from tdf_jax.model import Model, ModelInfo, encode
+from tdf_jax.modes import cluster_poses, pose_covariance
 from tdf_jax.network import NetworkConfig
+from tdf_jax.obstacles import box_obstacle, cloud_obstacle, field_obstacle, mesh_obstacle
 from tdf_jax.optimize import OptimizeConfig, Result, optimize
 from tdf_jax.paths import hang_on_rack, lift_over, line, semicircle, tilt_and_pour, wave
 from tdf_jax.pointcloud import load_points, thin

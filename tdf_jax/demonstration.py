@@ -15,6 +15,8 @@ from tdf_jax.model import Model, encode
 from tdf_jax.pointcloud import check_points
 from tdf_jax.trajectory import Trajectory, check_trajectory
 
+COMBINATIONS = ("mean", "median")
+
 
 @dataclasses.dataclass(frozen=True)
 class Demonstration:
@@ -49,7 +51,7 @@ class Reference:
     """What one or several demonstrations ask for, on any object of the category.
 
     Attributes:
-        descriptors: phi of the demonstration, (poses, queries, channels); of several, their mean, as in NDF.
+        descriptors: phi of the demonstration, (poses, queries, channels); of several, their mean or median.
         trajectory: T_object_query, relative to the demonstration's centroid with world axes; of several, the first's.
         query: query points in the query frame, metres.
     """
@@ -59,19 +61,23 @@ class Reference:
     query: Float[Array, "queries 3"]
 
 
-def describe(model: Model, demonstrations: Demonstration | Sequence[Demonstration]) -> Reference:
+def describe(model: Model, demonstrations: Demonstration | Sequence[Demonstration], combine: str = "mean") -> Reference:
     """Encode one or several demonstrations.
 
     Args:
         model: the network.
         demonstrations: one, or several with the same query points and number of poses.
+        combine: what is taken of several descriptors of a query point, channel by channel: their "mean", as in NDF, or their "median", which has the least sum of the absolute
+            differences that eq. 2 counts (docs/benchmark.md compares).
 
     Returns:
         The reference.
 
     Raises:
-        InputError: no demonstration, something else, or demonstrations that differ in query points or number of poses.
+        InputError: no demonstration, something else, demonstrations that differ in query points or number of poses, or an unknown combination.
     """
+    if combine not in COMBINATIONS:
+        raise InputError(f"describe(): combine is {combine!r}; expected one of {', '.join(COMBINATIONS)}")
     demonstrations = list(demonstrations) if isinstance(demonstrations, Iterable) else [demonstrations]
     kinds = sorted({type(demo).__name__ for demo in demonstrations})
     if kinds != ["Demonstration"]:
@@ -85,7 +91,8 @@ def describe(model: Model, demonstrations: Demonstration | Sequence[Demonstratio
             )
     query = jnp.asarray(first.query)
     fields = [encode(model, demo.points) for demo in demonstrations]
-    descriptors = sum(_describe(field, demo.trajectory, query) for field, demo in zip(fields, demonstrations)) / len(fields)
+    several = [_describe(field, demo.trajectory, query) for field, demo in zip(fields, demonstrations)]
+    descriptors = sum(several) / len(several) if combine == "mean" else jnp.median(jnp.stack(several), axis=0)
     return Reference(descriptors, first.trajectory.shifted(-fields[0].origin), query)
 
 

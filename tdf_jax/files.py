@@ -1,11 +1,16 @@
-"""Writing whole: a file or a folder appears under its name only once it is complete."""
+"""Writing whole: a file or a folder appears under its name only once it is complete; what took long to compute is kept."""
 
 import contextlib
+import hashlib
+import json
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 from tdf_jax.errors import InputError
 
@@ -37,6 +42,31 @@ def replace_file(function: str, path: str | os.PathLike, content: bytes | Callab
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
+
+
+def kept(function: str, folder: Path, about: Any, compute: Callable[[], Mapping[str, ArrayLike]]) -> dict[str, np.ndarray]:
+    """Arrays from a folder of such, or computed and put there.
+
+    Args:
+        function: who asks, for the message.
+        folder: receives one .npz; it exists.
+        about: all that the arrays depend on, as JSON has it; the file's name is its digest.
+        compute: makes them where they are missing.
+
+    Raises:
+        InputError: the file cannot be written, or is damaged.
+    """
+    digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
+    path = folder / f"{digest[:20]}.npz"
+    if not path.exists():
+        arrays = dict(compute())
+        replace_file(function, path, lambda file: np.savez(file, **arrays))
+        return {name: np.asarray(array) for name, array in arrays.items()}
+    try:
+        with np.load(path) as file:
+            return dict(file)
+    except Exception as error:  # damaged files raise whatever their parser stumbles on
+        raise InputError(f"{function}: {path} cannot be read ({error}); delete it: it is computed again") from None
 
 
 @contextlib.contextmanager

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from tdf_jax.carry import CarryConfig, carry
 from tdf_jax.demonstration import Demonstration, Reference, describe
 from tdf_jax.energy import EnergyWeights
 from tdf_jax.errors import InputError
@@ -24,12 +25,15 @@ def imitate(
     goal: Float[Array, "7"] | None = None,
     goal_offset: Float[Array, "3"] | None = None,
     fix_last: bool = True,
-    energy: EnergyWeights = EnergyWeights(),
-    config: SolveConfig | OptimizeConfig = SolveConfig(),
+    energy: EnergyWeights | None = None,
+    config: CarryConfig | SolveConfig | OptimizeConfig = CarryConfig(),
     progress: Callable | None = None,
     mesh: jax.sharding.Mesh | None = None,
 ) -> Result:
     """Imitate a demonstrated trajectory on a new object of the same category.
+
+    By default the pick is found by descriptors, and the demonstration is carried from there to the goal. With `config=SolveConfig()` or `OptimizeConfig()`
+    the paper's energy, eq. 3, is minimised over all waypoints, by Gauss-Newton steps or by Adam (docs/benchmark.md compares them).
 
     Clouds denser than the network's training clouds are thinned, see `encode`.
 
@@ -41,27 +45,32 @@ def imitate(
         goal: last pose, T_world_query as `wxyz_xyz`; by default, if it is kept, the demonstration's last pose, carried by the centroids.
         goal_offset: world vector added to the goal's translation, metres.
         fix_last: keep the last pose at the goal; without, and without a goal, all poses are found alike, such as the one pose of a grasp.
-        energy: weights of the terms.
-        config: settings of the solver, or, for Adam as in the paper and for energies with eq. 6, of `optimize`.
+        energy: weights of eq. 3's terms, by default the paper's; only with a `config` that minimises it.
+        config: settings of `carry`; or of `solve`; or, for Adam as in the paper and for energies with eq. 6, of `optimize`.
         progress, mesh: see `solve` and `optimize`.
 
     Returns:
         The result; `.trajectory` is the best one, T_world_query.
 
     Raises:
-        InputError: bad points, goal, offset or settings.
+        InputError: bad points, goal, offset or settings, or an energy that `carry` would not use.
     """
     check_key("imitate()", key)
-    if not isinstance(config, SolveConfig | OptimizeConfig):
-        raise InputError(f"imitate(): config is {config!r}; expected a SolveConfig or an OptimizeConfig")
+    if not isinstance(config, CarryConfig | SolveConfig | OptimizeConfig):
+        raise InputError(f"imitate(): config is {config!r}; expected a CarryConfig, SolveConfig or OptimizeConfig")
+    if isinstance(config, CarryConfig) and energy is not None:
+        raise InputError("imitate(): energy is given, but carrying minimises no eq. 3; expected config=SolveConfig() or OptimizeConfig() with it, or no energy")
     reference = demonstration if isinstance(demonstration, Reference) else describe(model, demonstration)
     field = encode(model, points)
     goal = None if goal is None else _finite("goal", goal, (7,))
     if goal_offset is not None:
         goal = default_goal(field, reference) if goal is None else goal
         goal = goal + jnp.pad(_finite("goal_offset", goal_offset, (3,)), (4, 0))
+    settings = {"goal": goal, "fix_last": fix_last, "progress": progress, "mesh": mesh}
+    if isinstance(config, CarryConfig):
+        return carry(field, reference, key, config=config, **settings)
     minimise = optimize if isinstance(config, OptimizeConfig) else solve
-    return minimise(field, reference, key, goal=goal, fix_last=fix_last, energy=energy, config=config, progress=progress, mesh=mesh)
+    return minimise(field, reference, key, energy=EnergyWeights() if energy is None else energy, config=config, **settings)
 
 
 def imitate_batch(

@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+import hashlib
+import json
 from collections.abc import Mapping
 
 import jax
@@ -69,6 +71,13 @@ def shape_problems(found: Mapping[str, tuple[int, ...]], expected: Mapping[str, 
 def value_problems(tensors: Mapping[str, np.ndarray]) -> str:
     """Every tensor that holds NaN or infinity, by name; empty if there is none."""
     return ", ".join(name for name, tensor in tensors.items() if not np.isfinite(tensor).all())
+
+
+def fingerprint(model: Model) -> str:
+    """A digest of all that a model's results depend on: weights, sizes, and the clouds it was trained on."""
+    digest = hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(model.params)))
+    digest.update(json.dumps([dataclasses.asdict(model.config), model.info.cloud_points]).encode())
+    return digest.hexdigest()
 
 
 def encode(model: Model, points: Float[Array, "points 3"], thinnings: int = THINNINGS) -> DescriptorField:

@@ -71,7 +71,7 @@ class OptimizeConfig:
 
 
 @functools.partial(
-    jax.tree_util.register_dataclass, data_fields=["trajectories", "losses", "energies", "starts"], meta_fields=[]
+    jax.tree_util.register_dataclass, data_fields=["trajectories", "losses", "energies", "starts", "confidence"], meta_fields=[]
 )
 @dataclasses.dataclass(frozen=True)
 class Result:
@@ -82,12 +82,14 @@ class Result:
         losses: (inits, iterations), the energy before each step; the first column is the start's.
         energies: (inits,), the energy of `trajectories`, after the last step.
         starts: (inits, poses, 7), where they began.
+        confidence: of `carry`: how likely the pick is right, in [0, 1], see `tdf_jax.confidence`; None of others.
     """
 
     trajectories: Float[Array, "inits poses 7"]
     losses: Float[Array, "inits iterations"]
     energies: Float[Array, "inits"]
     starts: Float[Array, "inits poses 7"]
+    confidence: float | None = None
 
     @property
     def finite(self) -> Bool[np.ndarray, "inits"]:
@@ -224,7 +226,7 @@ def prepare(
         goal = default_goal(field, reference) if goal is None and fix_last else goal
         starts = random_starts(key, field, reference, config.inits, config.start, config.start_radius)
     if goal is not None:
-        _check_goal(function, goal)
+        check_goal(function, goal)
     starts = np.asarray(starts)
     if starts.ndim != 3 or starts.shape[1:] != (reference.trajectory.poses, 7):
         raise InputError(
@@ -255,7 +257,8 @@ def _check_weights(function, energy):
             raise InputError(f"{function}: energy.{name} is {value}; expected one finite number of 0 or more")
 
 
-def _check_goal(function, goal):
+def check_goal(function: str, goal: Float[Array, "7"]) -> None:
+    """Raise InputError unless a goal is one finite pose."""
     values = np.asarray(goal)
     if values.shape != (7,) or not np.isfinite(values).all() or not values[:4].any():
         raise InputError(

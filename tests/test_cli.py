@@ -15,6 +15,7 @@ import tdf_jax as tdf
 from tdf_jax.cli import main as command_line, report, scene
 from tdf_jax.cli.main import main
 from tdf_jax.cli.settings import Settings
+from tdf_jax.evaluation.scene import PLACE
 from tdf_jax.evaluation.truth import pose_error
 from tdf_jax.paths import PATHS
 from tdf_jax.recording import save_demonstration
@@ -88,13 +89,23 @@ def record_of(folder):
 # What a run writes
 
 
-def test_the_default_method_is_the_solver(imitate, watched, capsys):
-    record = imitate("--points", 60, "--poses", 4, "--queries", 8, "--inits", 2)
-    assert record["settings"]["method"] == "gauss-newton" and record["settings"]["iterations"] is None
+def test_the_default_method_carries(imitate, watched, capsys):
+    record = imitate("--points", 60, "--poses", 4, "--queries", 8, "--inits", 6)
+    assert record["settings"]["method"] == "carry" and record["energy"] is None
+    assert record["optimiser"]["pick"] == dataclasses.asdict(tdf.CarryConfig().pick) | {"scouts": 6, "steps": list(tdf.CarryConfig().pick.steps)}
+    np.testing.assert_array_equal(np.float32(record["energies"]), watched[0].energies)
+    assert record["confidence"] == watched[0].confidence
+    out = capsys.readouterr().out
+    assert "6 starts of the pick, 4 poses, 8 queries" in out and "(of the best pick)" in out and f"{record['confidence']:.2f} that the pick" in out
+
+
+def test_the_papers_energy_can_be_solved(imitate, watched, capsys):
+    record = imitate("--points", 60, "--poses", 4, "--queries", 8, "--inits", 2, "--method", "gauss-newton", "--k", 0.1)
     assert tuple(record["optimiser"]["steps"]) == tdf.SolveConfig().steps and record["optimiser"]["inits"] == 2
+    assert record["energy"] == dataclasses.asdict(tdf.EnergyWeights(0.1)) and record["confidence"] is None
     np.testing.assert_array_equal(np.float32(record["energies"]), watched[0].energies)
     out = capsys.readouterr().out
-    assert "2 starts, 4 poses, 8 queries, 64 starts of the keyframe" in out and "the best candidate of every waypoint" in out
+    assert "2 starts, 64 of the keyframe, 4 poses, 8 queries" in out and "the best candidate of every waypoint" in out
 
 
 def test_a_run_writes_every_file_and_nothing_beside_them(folder):
@@ -109,7 +120,7 @@ def test_the_record_tells_all_settings(folder, weights):
     assert (record["schema"], record["tdf_jax"], record["seed"]) == (report.SCHEMA, tdf.__version__, 0)
     assert record["settings"] == {
         "target": None, "scale": 1.0, "target_pose": "random", "demonstration": None, "trajectory": "wave",
-        "goal_offset": [0.0, 0.0, 0.0], "k": 0.02, "method": "adam", "inits": 2, "poses": 4, "queries": 8, "iterations": 3, "points": 60,
+        "goal_offset": [0.0, 0.0, 0.0], "k": None, "method": "adam", "inits": 2, "poses": 4, "queries": 8, "iterations": 3, "points": 60,
         "seed": 0, "weights": str(weights), "out": str(folder), "no_plots": False, "json": False,
     }  # fmt: skip
     assert record["energy"] == dataclasses.asdict(tdf.EnergyWeights(0.02))
@@ -154,7 +165,7 @@ def test_the_goal_is_the_demonstrations_carried_by_the_centroids_and_offset(imit
     np.testing.assert_allclose(offset - plain, [0, 0, 0, 0, -0.1, 0.2, 0.3], atol=1e-6)
     model, pair = tdf.load_model(weights), scene.mug_case(0, 0, height=0.12, points=60)
     origins = [tdf.encode(model, tdf.thin(points, 40)).origin for points in (pair.points_a, pair.points_b)]
-    place = pair.T_world_place_a[:3, 3] + scene.PLACE - origins[0] + origins[1]
+    place = pair.T_world_place_a[:3, 3] + PLACE - origins[0] + origins[1]
     np.testing.assert_allclose(plain, [1, 0, 0, 0, *place], atol=1e-5)
 
 
@@ -265,7 +276,7 @@ def test_generated_demonstrations_go_from_the_handle_to_the_place(shape):
     shown, (handle_a, handle_b) = made.demonstration, made.T_world_handles
     ends = shown.trajectory.matrices
     np.testing.assert_allclose(ends[0], handle_a, atol=1e-6)
-    np.testing.assert_allclose(ends[-1, :3, 3] - handle_a[:3, 3], scene.PLACE, atol=1e-6)
+    np.testing.assert_allclose(ends[-1, :3, 3] - handle_a[:3, 3], PLACE, atol=1e-6)
     assert shown.query.shape == (7, 3) and np.abs(shown.query).max() <= 0.04
     np.testing.assert_allclose(handle_b[:3, :3], np.eye(3), atol=1e-6)  # the target in its canonical pose
     assert np.ptp(made.points[:, 2]) == pytest.approx(0.12, abs=0.002)
@@ -345,8 +356,9 @@ def test_bad_target_files(refusal, weights, tmp_path, name):
 
 
 @pytest.mark.parametrize(("words", "message"), [
-    (("--k", "-0.1"), "--k is -0.1; expected a weight of 0 or more"),
-    (("--k", "nan"), "--k is nan"),
+    (("--method", "adam", "--k", "-0.1"), "--k is -0.1; expected a weight of 0 or more"),
+    (("--method", "gauss-newton", "--k", "nan"), "--k is nan"),
+    (("--k", "0.02"), "--k is a weight of eq. 3, which --method carry does not minimise"),
     (("--poses", "1"), "poses is 1; expected a whole number of at least 2"),
     (("--inits", "0"), "inits is 0"),
     (("--method", "adam", "--iterations", "0"), "iterations is 0"),

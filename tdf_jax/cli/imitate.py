@@ -1,6 +1,7 @@
 """`tdf imitate`: the main job, from files or a pair of generated mugs to a folder of results."""
 
 import contextlib
+import dataclasses
 import json
 import time
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
+from tdf_jax.carry import CarryConfig
 from tdf_jax.checkpoint import load_model
 from tdf_jax.cli import report
 from tdf_jax.cli.scene import make_scene
@@ -48,8 +50,8 @@ def _run(settings: Settings, folder: Path) -> dict:
     began = time.perf_counter()
     query_key, start_key = jax.random.split(jax.random.fold_in(jax.random.key(settings.seed), STREAM))
     with _timed(seconds, "load"):
-        energy = EnergyWeights(settings.k)
         config = _config(settings)
+        energy = None if isinstance(config, CarryConfig) else EnergyWeights(0.02 if settings.k is None else settings.k)
         model = load_model(settings.weights)
         scene = make_scene(settings, query_key)
     with _timed(seconds, "encode"):
@@ -77,16 +79,21 @@ def _run(settings: Settings, folder: Path) -> dict:
     return record
 
 
-def _config(settings: Settings) -> SolveConfig | OptimizeConfig:
+def _config(settings: Settings) -> CarryConfig | SolveConfig | OptimizeConfig:
+    starts = {} if settings.inits is None else {"inits": settings.inits}
     if settings.method == "adam":
-        return OptimizeConfig(inits=settings.inits, iterations=100 if settings.iterations is None else settings.iterations)
+        return OptimizeConfig(**starts, **({} if settings.iterations is None else {"iterations": settings.iterations}))
     if settings.iterations is not None:
         raise InputError("tdf imitate: --iterations is for --method adam; drop one or add the other")
-    return SolveConfig(inits=settings.inits)
+    if settings.method == "gauss-newton":
+        return SolveConfig(**starts)
+    return CarryConfig(dataclasses.replace(CarryConfig().pick, **({} if settings.inits is None else {"scouts": settings.inits})))
 
 
-def _steps(config: SolveConfig | OptimizeConfig) -> int:
-    return config.iterations if isinstance(config, OptimizeConfig) else sum(config.steps)
+def _steps(config: CarryConfig | SolveConfig | OptimizeConfig) -> int:
+    if isinstance(config, OptimizeConfig):
+        return config.iterations
+    return sum((config.pick if isinstance(config, CarryConfig) else config).steps)
 
 
 def _draw(folder: Path, scene: Scene, result: Result, rows: str) -> None:

@@ -7,12 +7,14 @@ import jax
 import numpy as np
 
 import tdf_jax
+from tdf_jax.carry import CarryConfig
 from tdf_jax.cli.settings import Settings
 from tdf_jax.energy import EnergyWeights
 from tdf_jax.evaluation.scene import Scene
 from tdf_jax.evaluation.truth import path_error, pose_error
 from tdf_jax.model import Model
 from tdf_jax.optimize import OptimizeConfig, Result
+from tdf_jax.solve import SolveConfig
 from tdf_jax.trajectory import Trajectory
 
 SCHEMA = 1  # raised when a field of result.json changes its meaning or goes
@@ -45,8 +47,8 @@ def record(
     settings: Settings,
     model: Model,
     scene: Scene,
-    energy: EnergyWeights,
-    config: OptimizeConfig,
+    energy: EnergyWeights | None,
+    config: CarryConfig | SolveConfig | OptimizeConfig,
     result: Result,
     timings: dict[str, float],
 ) -> dict:
@@ -59,7 +61,7 @@ def record(
         "tdf_jax": tdf_jax.__version__,
         "seed": settings.seed,
         "settings": {name: _plain(value) for name, value in dataclasses.asdict(settings).items()},
-        "energy": dataclasses.asdict(energy),
+        "energy": None if energy is None else dataclasses.asdict(energy),
         "optimiser": dataclasses.asdict(config),
         "weights": dataclasses.asdict(model.info),
         "machine": {"jax": jax.__version__, "device": jax.devices()[0].device_kind, "backend": jax.default_backend()},
@@ -72,6 +74,7 @@ def record(
         "status": result.status,
         "best": result.best,
         "loss": {"start": float(result.losses[result.best, 0]), "end": result.loss},
+        "confidence": result.confidence,
         "errors": errors(trajectory, expected),
         "goal": _plain(trajectory.wxyz_xyz[-1]),
         "expected": None if expected is None else _plain(expected.wxyz_xyz),
@@ -84,19 +87,19 @@ def record(
 def table(record: dict, out: Path) -> str:
     """The record in a few lines."""
     found, seconds = record["errors"], record["seconds"]
-    sizes = record["demonstration"] | record["optimiser"]
-    parts = ", ".join(f"{name} {value:.1f}" for name, value in seconds.items() if name != "total")
-    pick = path = "n/a (the truth is not known)"
-    if found is not None:
-        pick = f"{100 * found['pick_metres']:.2f} cm, {np.degrees(found['pick_radians']):.1f} degrees"
-        path = f"{100 * found['path_metres']:.2f} cm, mean over waypoints"
-    solved = "scouts" in sizes
-    steps = "{scouts} starts of the keyframe" if solved else "{iterations} iterations"
-    best = "the best candidate of every waypoint" if solved else f"start {record['best'] + 1} of {sizes['inits']}; {record['status']}"
+    optimiser = record["optimiser"]
+    sizes = record["demonstration"] | optimiser.get("pick", optimiser)
+    if "pick" in optimiser:
+        starts, best = "{scouts} starts of the pick", "of the best pick"
+    elif "scouts" in sizes:
+        starts, best = "{inits} starts, {scouts} of the keyframe", "the best candidate of every waypoint"
+    else:
+        starts, best = "{inits} starts, {iterations} iterations", f"start {record['best'] + 1} of {sizes['inits']}; {record['status']}"
     rows = {
-        "run": f"{{inits}} starts, {{poses}} poses, {{queries}} queries, {steps}".format(**sizes),
+        "run": f"{starts}, {{poses}} poses, {{queries}} queries".format(**sizes),
         "loss, start": f"{record['loss']['start']:.5f}",
         "loss, end": f"{record['loss']['end']:.5f} ({best})",
+        "confidence": "n/a" if record["confidence"] is None else f"{record['confidence']:.2f} that the pick is right to 2 cm and 20 degrees",
         "pick-pose error": pick,
         "path error": path,
         "time": f"{seconds['total']:.1f} s ({parts})",

@@ -9,18 +9,15 @@ from tdf_jax.cli.settings import SceneSettings
 from tdf_jax.demonstration import Demonstration
 from tdf_jax.errors import InputError
 from tdf_jax.evaluation.cases import Case, mug_case, random_pose
-from tdf_jax.evaluation.scene import Scene
+from tdf_jax.evaluation.scene import Scene, handle_demonstration
+from tdf_jax.evaluation.transfer import QUERY_SIZE
 from tdf_jax.meshes import load_mesh
-from tdf_jax.paths import PATHS, SHAPES
 from tdf_jax.pointcloud import load_points
 from tdf_jax.query import box_query
 from tdf_jax.recording import load_demonstration
 from tdf_jax.trajectory import resample
 
 MUG_HEIGHT = 0.12  # metres
-QUERY_SIZE = 0.06  # metres, edge of the box of query points about the handle
-PLACE = (0.0, 0.24, 0.18)  # metres from the pick: 0.30 m away, to the handle's side and up
-LIFT = (0.0, 0.0, 1.0)  # a semicircle and a wave leave the straight line upwards first
 
 
 def make_scene(settings: SceneSettings, key: PRNGKeyArray) -> Scene:
@@ -76,10 +73,7 @@ def _read_target(settings: SceneSettings):
 
 
 def _generated(settings: SceneSettings, pair: Case, key: PRNGKeyArray) -> Demonstration:
-    pick = pair.T_world_place_a
-    start, bow = pick[:3, 3], {"bulge": LIFT} if settings.trajectory in SHAPES and settings.trajectory != "line" else {}
-    trajectory = PATHS[settings.trajectory](settings.poses, start, start + np.array(PLACE), rotation=pick[:3, :3], **bow)
-    return Demonstration(pair.points_a, trajectory, box_query(key, settings.queries, QUERY_SIZE))
+    return handle_demonstration(pair, settings.trajectory, settings.poses, box_query(key, settings.queries, QUERY_SIZE))
 
 
 def _moved(points, T):

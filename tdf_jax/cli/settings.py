@@ -55,8 +55,8 @@ class Settings(SceneSettings):
 
     Attributes:
         goal_offset: metres in the world, added to where the last pose goes.
-        k: weight of the correlation term; the paper's best is 0.02.
-        method: damped Gauss-Newton steps, or Adam's as in the paper.
+        k: weight of the correlation term of eq. 3, for the methods that minimise it; the paper's best is 0.02.
+        method: carry the demonstration from the pick to the goal; or minimise the paper's energy, eq. 3, by damped Gauss-Newton steps, or by Adam's as the paper does.
         inits: random starts.
         iterations: Adam's steps.
         out: folder to write; an earlier result there is replaced.
@@ -65,9 +65,9 @@ class Settings(SceneSettings):
     """
 
     goal_offset: Annotated[tuple[float, float, float], _option("X Y Z")] = (0.0, 0.0, 0.0)
-    k: float = 0.02
-    method: Literal["gauss-newton", "adam"] = "gauss-newton"
-    inits: int = 10
+    k: Annotated[float | None, _option("FLOAT", "0.02")] = None
+    method: Literal["carry", "gauss-newton", "adam"] = "carry"
+    inits: Annotated[int | None, _option("INT", "64 of the pick; 10 of other methods")] = None
     iterations: Annotated[int | None, _option("INT", "100")] = None
     out: Annotated[Path, _option("DIR")] = Path("imitation")
     no_plots: bool = False
@@ -153,7 +153,9 @@ def _check_numbers(settings: SceneSettings) -> None:
     if settings.target is None and settings.scale != 1:
         raise InputError(f"{settings.COMMAND}: --scale is for a --target file; give one, or drop --scale")
     if isinstance(settings, Settings):
-        if not 0 <= settings.k < np.inf:
+        if settings.k is not None and settings.method == "carry":
+            raise InputError("tdf imitate: --k is a weight of eq. 3, which --method carry does not minimise; drop it, or add --method gauss-newton or adam")
+        if settings.k is not None and not 0 <= settings.k < np.inf:
             raise InputError(f"tdf imitate: --k is {settings.k}; expected a weight of 0 or more")
         if not np.isfinite(settings.goal_offset).all():
             raise InputError(f"tdf imitate: --goal-offset is {settings.goal_offset}; expected three finite numbers, metres")

@@ -62,14 +62,32 @@ def iterative_closest_points(
     Source:
         Besl and McKay, A method for registration of 3-D shapes, PAMI 1992.
     """
+    motions, costs = settled_points(points_a, points_b, rotations)
+    return motions[int(np.argmin(costs))]
+
+
+def settled_points(
+    points_a: Float[np.ndarray, "points 3"], points_b: Float[np.ndarray, "seen 3"], rotations: Float[np.ndarray, "starts 3 3"]
+) -> tuple[Float[np.ndarray, "starts 4 4"], Float[np.ndarray, "starts"]]:
+    """Where point-to-point ICP settles from every start, see `iterative_closest_points`.
+
+    Returns:
+        Motions of cloud a onto cloud b, 4x4, and their mean squared distances, square metres.
+    """
     from scipy.spatial import cKDTree
 
     points_a, points_b = np.asarray(points_a, float), np.asarray(points_b, float)
     tree_a = cKDTree(points_a)
     starts = [_motion(R, points_a.mean(axis=0), points_b.mean(axis=0)) for R in rotations]
-    ends = [_icp(np.linalg.inv(T), points_a, points_b, tree_a) for T in starts]
-    T_a_b, _ = min(ends, key=lambda end: end[1])
-    return np.linalg.inv(T_a_b)
+    motions, costs = zip(*(_icp(np.linalg.inv(T), points_a, points_b, tree_a) for T in starts))
+    return np.linalg.inv(motions), np.array(costs)
+
+
+def rigid_motion(points_a: Float[np.ndarray, "points 3"], points_b: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "4 4"]:
+    """The motion of least squares of points onto those they correspond to, 4x4, without reflection or scale."""
+    from trimesh.registration import procrustes
+
+    return procrustes(points_a, points_b, reflection=False, scale=False)[0]
 
 
 def chamfer_distance(
@@ -122,15 +140,13 @@ def aligned(
 
 def _icp(T_a_b, points_a, points_b, tree_a):
     """The motion that settles, and its cost."""
-    from trimesh.registration import procrustes
-
     cost = np.inf
     for _ in range(STEPS):
         distances, nearest = tree_a.query(_moved(T_a_b, points_b))
         before, cost = cost, float(np.mean(distances**2))
         if cost >= (1 - SETTLED) * before:
             break
-        T_a_b, _, _ = procrustes(points_b, points_a[nearest], reflection=False, scale=False)
+        T_a_b = rigid_motion(points_b, points_a[nearest])
     return T_a_b, cost
 
 

@@ -7,11 +7,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tdf_jax.demonstration import Demonstration
+from tdf_jax.evaluation.cases import Case
 from tdf_jax.evaluation.truth import expected_trajectory
+from tdf_jax.paths import PATHS, SHAPES
 from tdf_jax.trajectory import Trajectory
 
 if TYPE_CHECKING:
     import trimesh
+
+PLACE = (0.0, 0.24, 0.18)  # metres from the pick: 0.30 m away, to the handle's side and up
+LIFT = (0.0, 0.0, 1.0)  # a semicircle and a wave leave the straight line upwards first
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,3 +42,18 @@ class Scene:
         if self.T_world_handles is None:
             return None
         return expected_trajectory(self.demonstration.trajectory, *self.T_world_handles, goal)
+
+
+def handle_demonstration(case: Case, path: str, poses: int, query: Float[Array, "queries 3"]) -> Demonstration:
+    """A trajectory shown on a case's first object, from its place (the handle) to `PLACE` away from there.
+
+    Args:
+        case: with the object and the place on it.
+        path: one of `tdf_jax.paths.PATHS`.
+        poses: of the trajectory.
+        query: points in the query frame, metres.
+    """
+    pick = case.T_world_place_a
+    start, bow = pick[:3, 3], {"bulge": LIFT} if path in SHAPES and path != "line" else {}
+    trajectory = PATHS[path](poses, start, start + np.multiply(PLACE, case.scale), rotation=pick[:3, :3], **bow)
+    return Demonstration(case.points_a, trajectory, query)

@@ -5,6 +5,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tdf_jax import poses
+from tdf_jax.carry import carry_trajectory
 from tdf_jax.trajectory import Trajectory
 
 FLIP_DEGREES = 170.0  # rotation errors above it are counted apart: the object was taken for its mirror image
@@ -18,10 +19,8 @@ def expected_trajectory(
 ) -> Trajectory:
     """The demonstrated trajectory as it ought to be on another object.
 
-    With A the motion of the semantic place (say, the handle) from object a to object b, and G that of the last pose to the
-    goal, waypoint i of n is moved by B_i at s = i / (n - 1): its rotation is the geodesic from A's to G's at s, and the
-    waypoint is carried to the point at s on the line between where A and where G would carry it. The first is the pick,
-    A T_0; the last is the goal.
+    With A the motion of the semantic place (say, the handle) from object a to object b, the first pose becomes A T_0 and the last the goal; between them
+    the demonstration is carried as `carry_trajectory` says. It is a definition: where object and goal moved differently, no way between them is the only right one.
 
     Args:
         demonstrated: T_world_query on object a.
@@ -33,15 +32,8 @@ def expected_trajectory(
         T_world_query on object b.
     """
     pick_motion = jnp.asarray(T_world_place_b @ np.linalg.inv(T_world_place_a), demonstrated.wxyz_xyz.dtype)
-    goal_motion = poses.compose(goal, poses.inverse(demonstrated.wxyz_xyz[-1]))
-    n = demonstrated.poses
-    s = jnp.arange(n) / (n - 1)
-    turn = poses.geodesic(pick_motion[:3, :3], poses.rotation(goal_motion), s)
-    t = demonstrated.translations
-    at_pick = poses.rotate(pick_motion[:3, :3], t) + pick_motion[:3, 3]
-    at_goal = poses.transform(goal_motion, t)
-    carried = (1 - s)[:, None] * at_pick + s[:, None] * at_goal
-    return Trajectory(poses.pose(jnp.matmul(turn, demonstrated.rotations), carried))
+    pick = poses.compose(poses.pose(pick_motion[:3, :3], pick_motion[:3, 3]), demonstrated.wxyz_xyz[0])
+    return carry_trajectory(demonstrated, pick, goal)
 
 
 def pose_error(found: Float[Array, "... 7"], truth: Float[Array, "... 7"]) -> tuple[np.ndarray, np.ndarray]:

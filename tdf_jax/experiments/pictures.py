@@ -1,7 +1,5 @@
 """The paper's figures, drawn from the data of their experiments."""
 
-from collections.abc import Sequence
-
 import matplotlib
 import numpy as np
 from jaxtyping import Float
@@ -15,9 +13,8 @@ from tdf_jax.experiments.run import Run
 from tdf_jax.experiments.table import vector
 from tdf_jax.trajectory import Trajectory
 from tdf_jax.viz.style import CLOUD, COLOURS, INK, STYLE, TRUTH, blank_figure, legend_of
-from tdf_jax.viz.view import View, bounds, content, draw, frame, triangles_of, waypoint_bar
+from tdf_jax.viz.view import WIDTH, View, bounds, panels, triangles_of
 
-WIDTH = 7.2  # inches, a page's text
 SHAPE_COLOURS = {"line": COLOURS(0.05), "semicircle": COLOURS(0.5), "wave": COLOURS(0.85)}
 SHAPE_STYLES = {"line": "-", "semicircle": "--", "wave": "-."}  # told apart without colour too
 OUTLINE = 400  # points of an object's outline
@@ -40,7 +37,7 @@ def figure1(runs: dict[str, Run], scene: Scene) -> Figure:
         r"after $l_t$ alone": View(trajectory=Trajectory(alone.found[whole.best]), expected=truth, **test),
         r"after $l_t + k\,l_c$": View(trajectory=Trajectory(whole.trajectory), expected=truth, **test),
     }
-    return _panels(list(views.items()), 2, bounds(np.asarray(shown.query)), len(whole.expected))
+    return panels(list(views.items()), 2, bounds(np.asarray(shown.query)), len(whole.expected))
 
 
 def figure4(runs: dict[tuple, Run], scenes: dict[tuple, Scene]) -> Figure:
@@ -66,7 +63,7 @@ def figure4(runs: dict[tuple, Run], scenes: dict[tuple, Scene]) -> Figure:
             )
         )
     query = np.asarray(next(iter(scenes.values())).demonstration.query)
-    return _panels(views, 3, bounds(query), len(next(iter(runs.values())).expected))
+    return panels(views, 3, bounds(query), len(next(iter(runs.values())).expected))
 
 
 def figure4_turn(runs: dict[tuple, Run]) -> Figure:
@@ -180,31 +177,6 @@ def _landscape(axes, panel: Swept, low: float, high: float):
     axes.xaxis.set_major_locator(MultipleLocator(0.6))
     axes.yaxis.set_major_locator(MultipleLocator(0.6))
     return picture
-
-
-def _panels(views: Sequence[tuple[str, View]], columns: int, box: Float[np.ndarray, "8 3"], poses: int) -> Figure:
-    """Three-dimensional views at one scale, with a legend below."""
-    rows = -(-len(views) // columns)
-    contents = [content(view, box) for _, view in views]
-    size = np.max([np.ptp(one, axis=0) for one in contents], axis=0) * 1.06
-    height = 6.6 / columns * rows + 0.6
-    foot = 0.6 / height
-    with matplotlib.rc_context(STYLE):
-        figure = blank_figure(WIDTH, height)
-        legend = {}
-        for index, (title, view) in enumerate(views):
-            row, column = divmod(index, columns)
-            tall = (1 - foot) / rows
-            axes = figure.add_axes(
-                ((column + 0.07) / columns, foot + tall * (rows - 1 - row), 0.83 / columns, 0.93 * tall), projection="3d"
-            )
-            draw(axes, view, box)
-            frame(axes, contents[index], size)
-            axes.set_title(title, y=1.0, fontsize=8)
-            legend |= legend_of(axes)
-        waypoint_bar(figure, poses, (0.62, 0.42 / height, 0.3, 0.1 / height))
-        figure.legend(legend.values(), legend.keys(), loc="lower left", bbox_to_anchor=(0.01, 0.0), frameon=False)
-    return figure
 
 
 def _plain(axes) -> None:

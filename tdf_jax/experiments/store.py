@@ -1,22 +1,17 @@
 """What was computed, kept in a folder: an experiment that was interrupted does only what is missing."""
 
 import dataclasses
-import hashlib
 import json
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import jax
-import numpy as np
-
-from tdf_jax.errors import InputError
 from tdf_jax.experiments.landscapes import Swept, figure2
 from tdf_jax.experiments.run import Run, imitation
 from tdf_jax.experiments.setting import SHAPES, Setting
-from tdf_jax.files import replace_file
-from tdf_jax.model import Model
+from tdf_jax.files import kept
+from tdf_jax.model import Model, fingerprint
 
 FORMAT = 2  # of the files, and of what they hold: raised when a run is computed otherwise
 
@@ -31,10 +26,8 @@ class Store:
 
     def __init__(self, model: Model, directory: Path):
         self.model, self.directory = model, directory
-        leaves = jax.tree.leaves(model.params)
-        weights = hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in leaves)).hexdigest()
         # All that a result depends on, so that a folder never mixes what different versions computed.
-        self._about = [FORMAT, version("tdf_jax"), weights, dataclasses.asdict(model.config), model.info.cloud_points]
+        self._about = [FORMAT, version("tdf_jax"), fingerprint(model)]
 
     def run(self, setting: Setting) -> Run:
         """One imitation."""
@@ -54,15 +47,7 @@ class Store:
         return self._kept(["landscapes", base, field, count], swept, panels)
 
     def _kept(self, what: list, compute: Callable[[], dict], build: Callable[[dict], Any]) -> Any:
-        about = json.dumps([self._about, what], sort_keys=True, default=dataclasses.asdict)
-        name = hashlib.sha256(about.encode()).hexdigest()[:20]
-        path = self.directory / f"{name}.npz"
-        if not path.exists():
-            arrays = compute()
-            replace_file("Store", path, lambda file: np.savez(file, **arrays))
-            return build(arrays)
-        try:
-            with np.load(path) as file:
-                return build(dict(file))
-        except Exception as error:  # damaged files raise whatever their parser stumbles on
-            raise InputError(f"Store: {path} cannot be read ({error}); delete it: it is computed again") from None
+        about = [self._about, what]
+        # Settings are dataclasses.
+        plain = json.loads(json.dumps(about, default=dataclasses.asdict))
+        return build(kept("Store", self.directory, plain, compute))

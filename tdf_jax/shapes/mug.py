@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tdf_jax.errors import InputError
-from tdf_jax.shapes.solid import Solid, Tube, in_solid, in_tube, mitres, resample, skin, solid_rings, tube_rings
+from tdf_jax.shapes.solid import Solid, Tube, in_solid, in_tube, mitres, polygon, resample, skin, solid_rings, tube_rings
 
 if TYPE_CHECKING:
     import trimesh
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 HANDLE_STYLES = ("d", "ring", "ear", "square")
 
 _TUBE_RINGS = 30  # rings along the handle
+_LANDMARKS_ALONG, _LANDMARKS_UP, _LANDMARKS_AROUND = 24, 16, 32  # along the handle; up the wall and around it
 _MAY_BE_ZERO = ("bulge", "edge_radius", "foot_height", "lip_radius")
 _DIMENSIONLESS = ("squareness", "handle_style", "handle_squareness", "handle_flare")
 
@@ -131,6 +132,23 @@ class Mug:
         for hollow in hollows:
             clay &= ~in_solid(hollow, points)
         return clay
+
+    def landmarks(self) -> Float[np.ndarray, "landmarks 3"]:
+        """Points that correspond from mug to mug, metres, object frame: as many on every mug, in the same order.
+
+        Along the handle at even shares of its centre line's length, on its four sides; on the outer wall at even shares of the height, at even angles.
+        """
+        p = self.parameters
+        line = _even(_centre_line(p), _LANDMARKS_ALONG)
+        tangent = np.gradient(line, axis=0)
+        normal = np.stack([tangent[:, 1], -tangent[:, 0]], axis=1) / np.linalg.norm(tangent, axis=1, keepdims=True)
+        middle = np.stack([line[:, 0], np.zeros(len(line)), line[:, 1]], axis=1)
+        thick = np.stack([normal[:, 0], np.zeros(len(line)), normal[:, 1]], axis=1) * p.handle_thickness / 2
+        wide = np.array([0.0, p.handle_width / 2, 0.0])
+        levels = np.linspace(0, p.height, _LANDMARKS_UP)
+        around = polygon(p.squareness, _LANDMARKS_AROUND)
+        wall = np.concatenate([np.column_stack([r * around, np.full(len(around), z)]) for r, z in zip(_wall(p, levels), levels - p.height / 2)])
+        return np.concatenate([middle + thick, middle - thick, middle + wide, middle - wide, wall])
 
 
 def build_mug(parameters: MugParameters = MugParameters()) -> Mug:
@@ -364,6 +382,13 @@ def _centre_line(p: MugParameters) -> np.ndarray:
         out = out / out.max()
     wall = x_bottom + (x_top - x_bottom) * (up + 1) / 2
     return np.stack([wall + out * (x_bar - wall), middle + half * up], axis=1)
+
+
+def _even(line: np.ndarray, count: int) -> np.ndarray:
+    """Points along a polyline, evenly spaced by length."""
+    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    even = np.linspace(0, at[-1], count)
+    return np.stack([np.interp(even, at, line[:, axis]) for axis in range(2)], axis=1)
 
 
 def _grip(tube: Tube, p: MugParameters) -> np.ndarray:

@@ -12,7 +12,7 @@ _TUBE_AROUND = 16  # polygon corners around the handle's tube
 
 
 class Solid(NamedTuple):
-    """A polygon of unit size (see `_polygon`) scaled by `radii` at `heights`, flat in between."""
+    """A polygon of unit size (see `polygon`) scaled by `radii` at `heights`, flat in between."""
 
     heights: np.ndarray
     radii: np.ndarray
@@ -32,7 +32,7 @@ class Tube(NamedTuple):
     squareness: float
 
 
-def _polygon(exponent: float, count: int) -> np.ndarray:
+def polygon(exponent: float, count: int) -> np.ndarray:
     """Corners (count, 2) on the unit superellipse at even angles, counter-clockwise from +x."""
     angle = np.arange(count) * (2 * np.pi / count)
     corners = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -41,7 +41,7 @@ def _polygon(exponent: float, count: int) -> np.ndarray:
 
 def _gauge(flat: np.ndarray, exponent: float, count: int) -> np.ndarray:
     """How much the polygon must grow to reach each point of `flat` (points, 2): 1 on its edges, as in the mesh."""
-    corners = _polygon(exponent, count)
+    corners = polygon(exponent, count)
     edges = np.linalg.solve(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1), np.ones((count, 2, 1)))[..., 0]
     sector = np.floor(np.arctan2(flat[:, 1], flat[:, 0]) * (count / (2 * np.pi))).astype(int) % count
     return np.sum(edges[sector] * flat, axis=1)
@@ -55,7 +55,7 @@ def in_solid(solid: Solid, points: np.ndarray) -> np.ndarray:
 
 def solid_rings(solid: Solid) -> np.ndarray:
     """The corners (rings, corners, 3) of a turned solid, upwards."""
-    rings = solid.radii[:, None, None] * _polygon(solid.squareness, _AROUND)
+    rings = solid.radii[:, None, None] * polygon(solid.squareness, _AROUND)
     heights = np.broadcast_to(solid.heights[:, None, None], (*rings.shape[:2], 1))
     return np.concatenate([rings, heights], axis=-1)
 
@@ -80,7 +80,7 @@ def in_tube(tube: Tube, points: np.ndarray) -> np.ndarray:
 
 def tube_rings(tube: Tube) -> np.ndarray:
     """The corners (rings, corners, 3) of a swept tube, along its line."""
-    section = _polygon(tube.squareness, _TUBE_AROUND) * tube.section
+    section = polygon(tube.squareness, _TUBE_AROUND) * tube.section
     flat = tube.line[:, None] + tube.scales[:, None, None] * section[:, :1] * tube.mitres[:, None]
     return np.stack([flat[..., 0], tube.scales[:, None] * section[:, 1], flat[..., 1]], axis=-1)
 

@@ -1,8 +1,10 @@
 """An object with a trajectory of query boxes in three dimensions: the panel that several pictures share."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib.cm import ScalarMappable
@@ -13,11 +15,12 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from tdf_jax.trajectory import Trajectory
 from tdf_jax.viz import solid
-from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, LIGHT, TRUTH
+from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, LIGHT, STYLE, TRUTH, blank_figure, legend_of
 
 if TYPE_CHECKING:
     import trimesh
 
+WIDTH = 7.2  # inches, a page's text
 SHOWN_POINTS = 1500  # of a cloud; more are a blot at the width of a page
 VIEW = {"elev": 22, "azim": -38}  # the handle faces the reader, the way to the place runs to the right
 MOST_TRIANGLES = 40_000  # of a mesh that is drawn as such: 1 s of matplotlib
@@ -109,6 +112,31 @@ def frame(axes: Axes3D, content: Float[np.ndarray, "points 3"], size: Float[np.n
     axes.set_box_aspect(tuple(size), zoom=1.01)  # a copy: matplotlib changes an array in place
     axes.patch.set_visible(False)
     axes.view_init(**VIEW)
+
+
+def panels(views: Sequence[tuple[str, View]], columns: int, box: Float[np.ndarray, "8 3"], poses: int) -> Figure:
+    """Three-dimensional views at one scale, with a legend below."""
+    rows = -(-len(views) // columns)
+    contents = [content(view, box) for _, view in views]
+    size = np.max([np.ptp(one, axis=0) for one in contents], axis=0) * 1.06
+    height = 6.6 / columns * rows + 0.6
+    foot = 0.6 / height
+    with matplotlib.rc_context(STYLE):
+        figure = blank_figure(WIDTH, height)
+        legend = {}
+        for index, (title, view) in enumerate(views):
+            row, column = divmod(index, columns)
+            tall = (1 - foot) / rows
+            axes = figure.add_axes(
+                ((column + 0.07) / columns, foot + tall * (rows - 1 - row), 0.83 / columns, 0.93 * tall), projection="3d"
+            )
+            draw(axes, view, box)
+            frame(axes, contents[index], size)
+            axes.set_title(title, y=1.0, fontsize=8)
+            legend |= legend_of(axes)
+        waypoint_bar(figure, poses, (0.62, 0.42 / height, 0.3, 0.1 / height))
+        figure.legend(legend.values(), legend.keys(), loc="lower left", bbox_to_anchor=(0.01, 0.0), frameon=False)
+    return figure
 
 
 def waypoint_bar(figure: Figure, poses: int, place: tuple[float, float, float, float]) -> None:

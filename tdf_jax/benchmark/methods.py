@@ -1,0 +1,221 @@
+"""What imitates a task: the library, the paper's energy, and baselines from copying to an oracle, each with as many starts.
+
+A method's rows are its starts (of the solver: its distinct solutions), each a whole trajectory that ends at the goal, with a score that its best is chosen by.
+Methods that find one motion of the object carry the demonstration as the library does (`tdf_jax.carry.carry_trajectory`), unless their name says otherwise.
+"""
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from tdf_jax import poses
+from tdf_jax.benchmark.task import Task, carried_by
+from tdf_jax.carry import carry, carry_trajectory
+from tdf_jax.demonstration import Reference, describe
+from tdf_jax.energy import EnergyWeights
+from tdf_jax.evaluation.baselines import principal_axes, rigid_motion, settled_points
+from tdf_jax.evaluation.comparison import random_weights
+from tdf_jax.field import DescriptorField
+from tdf_jax.model import Model, encode
+from tdf_jax.optimize import OptimizeConfig, Result, optimize
+from tdf_jax.shapes import Mug
+from tdf_jax.solve import SolveConfig, solve
+from tdf_jax.trajectory import Trajectory
+
+LIBRARY = "tdf_jax"
+NEAR = 0.04  # metres from the pick within which the oracle's correspondences count
+PAPER = {  # the paper's energy
+    "TDF, k = 0": EnergyWeights(0.0),
+    "TDF, k = 0.02": EnergyWeights(0.02),
+    "TDF, k = 0.2": EnergyWeights(0.2),
+    "TDF, k = 0.02, plain norm": EnergyWeights(0.02, lever=1.0),
+}
+COMPENSATED = "TDF, l_p"
+COMPENSATOR = EnergyWeights(0.0, compensator=0.02)  # the paper gives no weight: that of the term it was to replace
+STREAM = 0xBE9C4  # folded into the key of starts
+
+
+@dataclasses.dataclass(frozen=True)
+class Attempt:
+    """What a method came to on a task.
+
+    Attributes:
+        trajectories: of every start, T_world_query, (starts, poses, 7).
+        scores: the lower the better, (starts,).
+        seconds: of one imitation, encoding included.
+        confidence: of the best, NaN where the method has none.
+    """
+
+    trajectories: Float[np.ndarray, "starts poses 7"]
+    scores: Float[np.ndarray, "starts"]
+    seconds: float
+    confidence: float = float("nan")
+
+    @property
+    def best(self) -> int:
+        """The start that is chosen."""
+        return int(np.argmin(np.where(np.isfinite(self.scores), self.scores, np.inf)))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Encoded:
+    """A task as a network sees it, the seconds that this took, and NDF's picks, which two methods share."""
+
+    field: DescriptorField
+    reference: Reference
+    seconds: float
+    picks: dict
+
+
+class Attempts:
+    """What methods come to on one task, which is encoded once, when the first of them asks.
+
+    Args:
+        task: what to imitate.
+        model: the network.
+        key: random key of the benchmark; the starts of a task are a function of it and the task's index.
+        inits: random starts.
+    """
+
+    def __init__(self, task: Task, model: Model, key: PRNGKeyArray, inits: int):
+        self.task, self.model, self.inits = task, model, inits
+        self.key = jax.random.fold_in(jax.random.fold_in(key, STREAM), task.index)
+
+    @functools.cached_property
+    def _encoded(self) -> _Encoded:
+        return _encoded(self.task, self.model)
+
+    def of(self, method: str) -> Attempt | None:
+        """The attempt of one of `METHODS`; None where it cannot be tried, such as the oracle on a mesh without correspondences."""
+        encoded = self._encoded if method in NETWORKS else None
+        return METHODS[method](self.task, self.model, encoded, self.key, self.inits)
+
+
+def _encoded(task, model) -> _Encoded:
+    began = time.perf_counter()
+    reference, field = describe(model, task.demonstration), encode(model, task.case.points_b)
+    jax.block_until_ready((reference, field))
+    return _Encoded(field, reference, time.perf_counter() - began, {})
+
+
+def _copy(task, *_) -> Attempt:
+    return _motionless(task, np.zeros(3, np.float32))
+
+
+def _centroids(task, *_) -> Attempt:
+    return _motionless(task, task.case.points_b.mean(axis=0) - task.case.points_a.mean(axis=0))
+
+
+def _motionless(task, shift) -> Attempt:
+    trajectory = np.array(task.demonstration.trajectory.shifted(shift).wxyz_xyz)
+    trajectory[-1] = task.goal
+    return Attempt(trajectory[None], np.zeros(1), 0.0)
+
+
+def _principal_axes(task, *_) -> Attempt:
+    began = time.perf_counter()
+    T_b_a = principal_axes(task.case.points_a, task.case.points_b)
+    return _carried(task, carried_by(task, T_b_a)[None], np.zeros(1), time.perf_counter() - began)
+
+
+def _closest_points(task, model, encoded, key, inits) -> Attempt:
+    rotations = np.asarray(poses.uniform_rotations(key, inits), float)
+    began = time.perf_counter()
+    motions, costs = settled_points(task.case.points_a, task.case.points_b, rotations)
+    return _carried(task, carried_by(task, motions), costs, time.perf_counter() - began)
+
+
+def _oracle(task, *_) -> Attempt | None:
+    """The rigid motion of least squares between points that are known to correspond, near the pick."""
+    case = task.case
+    if not isinstance(case.object_b, Mug):
+        return None
+    a, b = (one.landmarks() for one in (case.object_a, case.object_b))
+    near = np.linalg.norm(a - np.asarray(task.demonstration.trajectory.translations[0]), axis=1) < NEAR * case.scale
+    T_b_a = case.T_world_b @ rigid_motion(a[near], b[near])
+    return _carried(task, carried_by(task, T_b_a)[None], np.zeros(1), 0.0)
+
+
+def _descriptor_fields(task, model, encoded, key, inits, *, rigidly=False) -> Attempt:
+    """NDF: one pose by Adam at the pick."""
+    if not encoded.picks:
+        picked = Reference(encoded.reference.descriptors[:1], Trajectory(encoded.reference.trajectory.wxyz_xyz[:1]), encoded.reference.query)
+        began = time.perf_counter()
+        result = optimize(encoded.field, picked, key, fix_last=False, energy=EnergyWeights(0.0), config=OptimizeConfig(inits=inits))
+        jax.block_until_ready(result)
+        seconds = time.perf_counter() - began + encoded.seconds
+        encoded.picks.update(picks=np.asarray(result.trajectories[:, 0]), scores=np.asarray(result.energies), seconds=seconds)
+    return _carried(task, **encoded.picks, rigidly=rigidly)
+
+
+def _replay(*arguments) -> Attempt:
+    return _descriptor_fields(*arguments, rigidly=True)
+
+
+def _untrained(task, model, encoded, key, inits) -> Attempt:
+    return _descriptor_fields(task, model, _encoded(task, random_weights(model, 0)), key, inits)
+
+
+def _library(task, model, encoded, key, inits) -> Attempt:
+    return _timed(encoded, lambda: carry(encoded.field, encoded.reference, key, goal=jnp.asarray(task.goal)))
+
+
+def _paper(energy: EnergyWeights) -> Callable:
+    """Eq. 3 over all waypoints. Its solver takes more starts of one waypoint and finds lower energies than Adam from as many starts."""
+
+    def method(task, model, encoded, key, inits):
+        return _timed(
+            encoded,
+            lambda: solve(
+                encoded.field, encoded.reference, key, goal=jnp.asarray(task.goal), energy=energy, config=SolveConfig(inits=inits, finalists=2)
+            ),
+        )
+
+    return method
+
+
+def _compensated(task, model, encoded, key, inits) -> Attempt:
+    """Eq. 6 couples the waypoints: Adam."""
+    goal, config = jnp.asarray(task.goal), OptimizeConfig(inits=inits)
+    return _timed(encoded, lambda: optimize(encoded.field, encoded.reference, key, goal=goal, energy=COMPENSATOR, config=config))
+
+
+METHODS: dict[str, Callable] = {
+    "copy": _copy,
+    "centroids": _centroids,
+    "PCA": _principal_axes,
+    "ICP": _closest_points,
+    "random weights": _untrained,
+    "NDF pick, rigid replay": _replay,
+    "NDF pick, carried": _descriptor_fields,
+    **{name: _paper(energy) for name, energy in PAPER.items()},
+    COMPENSATED: _compensated,
+    LIBRARY: _library,
+    "oracle correspondences": _oracle,
+}
+NETWORKS = ("NDF pick, rigid replay", "NDF pick, carried", *PAPER, COMPENSATED, LIBRARY)  # those that use the network's descriptors
+
+
+def _timed(encoded, run: Callable[[], Result]) -> Attempt:
+    began = time.perf_counter()
+    result = jax.block_until_ready(run())
+    seconds = time.perf_counter() - began + encoded.seconds
+    sure = float("nan") if result.confidence is None else float(result.confidence)
+    return Attempt(np.asarray(result.trajectories), np.asarray(result.energies), seconds, sure)
+
+
+def _carried(task, picks, scores, seconds, *, rigidly=False) -> Attempt:
+    trajectories = np.array(_carry_all(task.demonstration.trajectory, picks, None if rigidly else task.goal))
+    trajectories[:, -1] = task.goal
+    return Attempt(trajectories, scores, seconds)
+
+
+@jax.jit
+def _carry_all(shown, picks, goal):
+    return jax.vmap(lambda pick: carry_trajectory(shown, pick, goal).wxyz_xyz)(picks)

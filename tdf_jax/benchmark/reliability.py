@@ -1,0 +1,61 @@
+"""Whether confidences are what they say: of picks with a confidence of 0.8, eight in ten ought to be right."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+BINS = 8
+
+
+def bins(predicted: Float[np.ndarray, " picks"], right: Float[np.ndarray, " picks"]) -> list[dict]:
+    """Picks in bins of equal numbers, by rising confidence.
+
+    Args:
+        predicted: confidences.
+        right: 1 where the pick was, else 0.
+
+    Returns:
+        For each bin the number of picks, the mean confidence, the share that was right and its 95 % interval (Wilson).
+    """
+    order = np.argsort(predicted, kind="stable")
+    rows = []
+    for chosen in np.array_split(order, min(BINS, len(order))):
+        n, rate, z = len(chosen), float(right[chosen].mean()), 1.96
+        middle, half = rate + z**2 / (2 * n), z * np.sqrt(rate * (1 - rate) / n + z**2 / (4 * n**2))
+        low, high = ((middle + sign * half) / (1 + z**2 / n) for sign in (-1, 1))
+        rows.append({"picks": n, "predicted": float(predicted[chosen].mean()), "right": rate, "interval": [float(min(low, rate)), float(max(high, rate))]})
+    return rows
+
+
+def calibration_error(rows: Sequence[dict]) -> float:
+    """Mean difference of confidence and share of right picks over bins, weighted by their numbers (expected calibration error)."""
+    total = sum(row["picks"] for row in rows)
+    return float(sum(row["picks"] * abs(row["predicted"] - row["right"]) for row in rows) / total)
+
+
+def ranking(predicted: Float[np.ndarray, " picks"], right: Float[np.ndarray, " picks"]) -> float | None:
+    """Share of pairs of a right and a wrong pick of which the right one has the higher confidence (area under the ROC); None without both kinds."""
+    good, bad = predicted[right == 1], predicted[right == 0]
+    if not len(good) or not len(bad):
+        return None
+    return float(np.mean((good[:, None] > bad) + 0.5 * (good[:, None] == bad)))
+
+
+def fit(residual: Float[np.ndarray, " picks"], right: Float[np.ndarray, " picks"]) -> tuple[float, float]:
+    """Intercept and slope of `tdf_jax.confidence` of maximal likelihood, by Newton's method.
+
+    Args:
+        residual: of picks.
+        right: 1 where the pick was, else 0; both must occur.
+    """
+    x = np.stack([np.ones(len(residual)), -np.log(residual)], axis=1)
+    weights = np.zeros(2)
+    for _ in range(100):
+        p = 1 / (1 + np.exp(-x @ weights))
+        # A faint pull to zero keeps it finite where right and wrong do not overlap.
+        step = np.linalg.solve(x.T @ (x * (p * (1 - p))[:, None]) + 1e-3 * np.eye(2), x.T @ (right - p) - 1e-3 * weights)
+        weights += step
+        if np.abs(step).max() < 1e-9:
+            break
+    return float(weights[0]), float(weights[1])

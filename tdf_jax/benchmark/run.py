@@ -1,0 +1,58 @@
+"""The benchmark's tasks, one after the other, by every method; what was computed is kept, so that an interrupted run goes on."""
+
+from collections.abc import Callable, Iterator, Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+from tdf_jax.benchmark.methods import METHODS, Attempt, Attempts
+from tdf_jax.benchmark.task import Task
+from tdf_jax.errors import InputError
+from tdf_jax.files import kept
+from tdf_jax.model import Model, fingerprint
+
+FORMAT = 1  # of what is kept: raised when an attempt is computed otherwise
+
+
+def run(
+    makers: Sequence[Callable[[], Task]], model: Model, methods: Sequence[str], folder: Path, *, seed: int = 0, inits: int = 10, progress: bool = True
+) -> Iterator[tuple[Task, str, Attempt]]:
+    """Attempts of methods on tasks.
+
+    Args:
+        makers: each makes a task.
+        model: the network.
+        methods: of `METHODS`.
+        folder: keeps the attempts; it exists.
+        seed: of the starts.
+        inits: random starts.
+        progress: show a progress bar.
+
+    Yields:
+        Task, name of the method, attempt; without those that cannot be tried.
+
+    Raises:
+        InputError: there is no such method, or a kept file is damaged.
+    """
+    for method in methods:
+        if method not in METHODS:
+            raise InputError(f"run(): methods has {method!r}; expected some of {', '.join(METHODS)}")
+    about = [FORMAT, version("tdf_jax"), fingerprint(model), seed, inits]
+    key = jax.random.key(seed)
+    for make in tqdm(makers, desc="benchmark", unit="task", disable=not progress):
+        task = make()
+        attempts = Attempts(task, model, key, inits)
+        for method in methods:
+
+            def arrays(method=method):
+                attempt = attempts.of(method)
+                return {} if attempt is None else vars(attempt)
+
+            what = [*about, task.index, task.case.instance, task.case.clouds, task.case.scale, task.goal.tolist(), method]
+            found = kept("tdf benchmark", folder, what, arrays)
+            if found:
+                yield task, method, Attempt(found["trajectories"], found["scores"], float(found["seconds"]), float(found["confidence"]))
+
