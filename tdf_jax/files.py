@@ -63,7 +63,7 @@ def kept(function: str, folder: Path, about: Any, compute: Callable[[], Mapping[
         replace_file(function, path, lambda file: np.savez(file, **arrays))
         return {name: np.asarray(array) for name, array in arrays.items()}
     try:
-        with np.load(path) as file:
+        with path.open("rb") as opened, np.load(opened) as file:
             return dict(file)
     except Exception as error:  # damaged files raise whatever their parser stumbles on
         raise InputError(f"{function}: {path} cannot be read ({error}); delete it: it is computed again") from None

@@ -3,11 +3,12 @@
 import jax
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from tdf_jax import poses
 from tdf_jax.errors import InputError
-from tdf_jax.evaluation.baselines import aligned, chamfer_distance, iterative_closest_points, principal_axes
+from tdf_jax.evaluation.baselines import aligned, chamfer_distance, iterative_closest_points, principal_axes, rigid_motion, settled_points
 from tdf_jax.evaluation.cases import mug_case
 from tdf_jax.evaluation.transfer import place_errors
 
@@ -42,6 +43,23 @@ def test_icp_finds_the_motion_from_one_of_several_starts(cloud):
     np.testing.assert_allclose(iterative_closest_points(cloud, moved(T, cloud), starts), T, atol=1e-3)
     alone = iterative_closest_points(cloud, moved(T, cloud), starts[:1])
     assert np.abs(alone - T).max() > 0.1  # so the choice among starts matters
+
+
+def test_icp_tells_where_every_start_settles(cloud):
+    T = motion(1)
+    starts = np.stack([Rotation.from_rotvec([2.5, 0, 0]).as_matrix() @ T[:3, :3], T[:3, :3]])
+    motions, costs = settled_points(cloud, moved(T, cloud), starts)
+    np.testing.assert_allclose(motions[1], T, atol=1e-6)
+    assert costs[1] < 1e-12 < costs[0]
+    nearest = cKDTree(moved(motions[0], cloud)).query(moved(T, cloud))[0]
+    np.testing.assert_allclose(costs[0], np.mean(nearest**2), rtol=0.01)  # of the last step but one
+
+
+def test_points_that_correspond_give_their_motion(cloud):
+    T = motion(3)
+    np.testing.assert_allclose(rigid_motion(cloud[:4], moved(T, cloud[:4])), T, atol=1e-9)
+    mirrored = rigid_motion(cloud, cloud * [-1, 1, 1])
+    assert np.linalg.det(mirrored[:3, :3]) == pytest.approx(1)
 
 
 def test_icp_matches_a_part_with_the_whole(cloud):

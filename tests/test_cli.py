@@ -198,7 +198,7 @@ def test_the_table(folder, weights, tmp_path, capsys):
     record = record_of(tmp_path / "out")
     rows = {line[:17].strip(): line[17:] for line in out.splitlines()}
     assert list(rows) == [
-        "run", "loss, start", "loss, end", "pick-pose error", "path error", "time", "written to"
+        "run", "loss, start", "loss, end", "solutions", "pick-pose error", "path error", "time", "written to"
     ]  # fmt: skip
     assert rows["loss, start"] == f"{record['loss']['start']:.5f}"
     assert rows["loss, end"].startswith(f"{record['loss']['end']:.5f} (start {record['best'] + 1} of 2")
@@ -360,7 +360,7 @@ def test_bad_target_files(refusal, weights, tmp_path, name):
     (("--method", "gauss-newton", "--k", "nan"), "--k is nan"),
     (("--k", "0.02"), "--k is a weight of eq. 3, which --method carry does not minimise"),
     (("--poses", "1"), "poses is 1; expected a whole number of at least 2"),
-    (("--inits", "0"), "inits is 0"),
+    (("--inits", "0"), "--inits is 0"),
     (("--method", "adam", "--iterations", "0"), "iterations is 0"),
     (("--iterations", "50"), "--iterations is for --method adam"),
     (("--queries", "0"), "count is 0"),
@@ -629,6 +629,6 @@ def test_every_start_non_finite_is_told(refusal, weights, monkeypatch):
 
 
 def test_commands_are_the_functions_of_their_modules():
-    assert set(command_line.COMMANDS) == {"imitate", "landscape", "convert", "evaluate", "dataset", "train", "reproduce"}
+    assert set(command_line.COMMANDS) == {"imitate", "landscape", "convert", "evaluate", "benchmark", "dataset", "train", "reproduce"}
     for name in command_line.COMMANDS:
         assert callable(getattr(sys.modules[f"tdf_jax.cli.{name}"], name))

@@ -47,6 +47,24 @@ def test_several_demonstrations_give_the_mean_of_their_descriptors(small_model, 
     np.testing.assert_allclose(twice.descriptors, reference.descriptors, atol=1e-7)
 
 
+def test_several_demonstrations_give_the_median_if_asked(small_model, demonstration, other, reference):
+    third = dataclasses.replace(other, points=jnp.asarray(random_cloud(9), jnp.float32))
+    found = tdf.describe(small_model, [demonstration, other, third], combine="median")
+    alone = [reference, tdf.describe(small_model, other), tdf.describe(small_model, third)]
+    expected = np.median([one.descriptors for one in alone], axis=0)
+    np.testing.assert_allclose(found.descriptors, expected, atol=1e-6)
+    # The least sum of the absolute differences that eq. 2 counts: the mean's is more.
+    mean = tdf.describe(small_model, [demonstration, other, third])
+    sums = [sum(np.abs(one.descriptors - centre.descriptors).sum() for one in alone) for centre in (found, mean)]
+    assert sums[0] < 0.999 * sums[1]
+    np.testing.assert_array_equal(tdf.describe(small_model, demonstration, combine="median").descriptors, reference.descriptors)
+
+
+def test_an_unknown_combination_is_refused(small_model, demonstration):
+    with pytest.raises(InputError, match="combine is 'best'; expected one of mean, median"):
+        tdf.describe(small_model, demonstration, combine="best")
+
+
 def test_clouds_are_thinned_to_the_networks_density(small_model, demonstration, reference):
     dense = np.concatenate([random_cloud(0), random_cloud(0) + 1e-3]).astype(np.float32)
     assert thin(dense, 40).shape == (40, 3)

@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from tdf_jax import poses
-from tdf_jax.benchmark.methods import STREAM
+from tdf_jax.benchmark.methods import EVERY, STREAM
 from tdf_jax.benchmark.task import Task
 from tdf_jax.carry import carry
 from tdf_jax.demonstration import COMBINATIONS, Demonstration, Reference, describe
@@ -42,7 +42,7 @@ class Learnt:
 def learnt(
     makers: Sequence[Callable[[], Task]], model: Model, counts: Sequence[int], folder: Path, *, seed: int = 0, progress: bool = True
 ) -> list[Learnt]:
-    """Picks on the targets of tasks, learnt from 1, 3, ... demonstrations at the place of other mugs of the same height.
+    """Picks on the targets of every fifth task, learnt from 1, 3, ... demonstrations at the place of other mugs of the same height.
 
     Args:
         makers: each makes a task; its target, its query points and its truth are used.
@@ -56,6 +56,8 @@ def learnt(
     about = [FORMAT, version("tdf_jax"), fingerprint(model), seed]
     for make in tqdm(makers if counts else (), desc="demonstrations", unit="task", disable=not progress):
         task = make()
+        if task.index % EVERY:
+            continue
         shown = functools.cache(functools.partial(_demonstrations, task, seed, max(counts)))
         for count in counts:
             for way in COMBINATIONS if count > 1 else COMBINATIONS[:1]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from tdf_jax.benchmark import task as tasks
 from tdf_jax.benchmark.demonstrations import Learnt
-from tdf_jax.benchmark.methods import LIBRARY, NEAR
+from tdf_jax.benchmark.methods import EVERY, LIBRARY, NEAR
 from tdf_jax.benchmark.reliability import bins, calibration_error, ranking
 from tdf_jax.benchmark.scores import MISSED, THRESHOLDS, Score, by_method, interval, summarised
 from tdf_jax.model import Model
@@ -91,7 +91,8 @@ def _told(scores, model, settings) -> str:
         f"`{command}`: {objects} objects, weights `{model.info.name}`, {settings['inits']} starts of each method (`tdf_jax` scouts from 64, on a few query points; its time is told). A task is a trajectory of {tasks.POSES} poses shown at the handle of one mug and asked for on another in a uniform random pose, with a goal. Six paths take turns and, "
         "with each, four goals: the demonstration's last pose carried by the centroids, moved by 10 or 30 cm in a random direction, or put as far behind the pick as it "
         "lay ahead. The truth has the same place on the other mug as its pick; from there to the goal the demonstration turns evenly with what lies between both motions. That part is a "
-        "definition: methods whose name says *carried* carry by the same formula, and their path errors are their pick's, handed on.\n\n"
+        "definition: methods whose name says *carried* carry by the same formula, and their path errors are their pick's, handed on. "
+        f"Variants are tried on every {EVERY}th task.\n\n"
         "Success is of the pick of the start that the method itself chose; *best start* is that of the start nearest to the truth, which no method knows. Intervals are 95 % bootstrap intervals over objects. "
         f"Seconds are of one imitation on {jax.default_backend()}, encoding included, compilation not; other work may have run beside it."
     )
@@ -161,7 +162,7 @@ def _reliability(found: Mapping[str, Any]) -> str:
     rows = [[f"{one['predicted']:.3f}", str(one["picks"]), f"{one['right']:.3f}", "{:.2f} to {:.2f}".format(*one["interval"])] for one in found["bins"]]
     order = "" if found["ranking"] is None else f" Of a right and a wrong pick the right one has the higher confidence in {100 * found['ranking']:.0f} % of pairs."
     return (
-        f"## Confidence\n\n`result.confidence` of the {found['picks']} picks of `{LIBRARY}`, all clouds, in bins of equal numbers. It was fitted on picks of another seed. "
+        f"## Confidence\n\n`result.confidence` of the {found['picks']} picks of `{LIBRARY}`, all clouds, in bins. It was fitted on picks of another seed. "
         f"Mean difference of confidence and share: {found['calibration_error']:.3f}.{order}\n\n![Reliability]({PICTURES['reliability']})\n\n" + markdown(heads, rows)
     )
 
@@ -174,7 +175,7 @@ def _demonstrations(found: Sequence[Mapping[str, Any]]) -> str:
         distance, angle = 100 * np.array(one["distances"]), np.array(one["angles"])
         cells += [f"{np.median(values):.{d}f} / {np.percentile(values, 90):.{d}f}" for values, d in ((distance, 2), (angle, 1))]
         rows.append([*cells, *(f"{100 * np.mean((distance <= 100 * metres) & (angle <= degrees)):.0f} %" for metres, degrees in THRESHOLDS.values())])
-    told = "## Several demonstrations\n\nPicks on the same targets, learnt from the handles of several other mugs."
+    told = "## Several demonstrations\n\nPicks on the targets of every fifth task, learnt from the handles of several other mugs."
     return f"{told}\n\n![Success against the number of demonstrations]({PICTURES['demonstrations']})\n\n" + markdown(heads, rows)
 
 

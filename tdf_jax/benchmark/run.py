@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from tdf_jax.benchmark.methods import METHODS, Attempt, Attempts
+from tdf_jax.benchmark.methods import METHODS, Attempt, Attempts, tried
 from tdf_jax.benchmark.task import Task
 from tdf_jax.errors import InputError
 from tdf_jax.files import kept
@@ -32,7 +32,7 @@ def run(
         progress: show a progress bar.
 
     Yields:
-        Task, name of the method, attempt; without those that cannot be tried.
+        Task, name of the method, attempt; without those that cannot be tried, and variants on every fifth task alone.
 
     Raises:
         InputError: there is no such method, or a kept file is damaged.
@@ -45,7 +45,7 @@ def run(
     for make in tqdm(makers, desc="benchmark", unit="task", disable=not progress):
         task = make()
         attempts = Attempts(task, model, key, inits)
-        for method in methods:
+        for method in (method for method in methods if tried(method, task.index)):
 
             def arrays(method=method):
                 attempt = attempts.of(method)

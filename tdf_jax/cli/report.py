@@ -13,6 +13,7 @@ from tdf_jax.energy import EnergyWeights
 from tdf_jax.evaluation.scene import Scene
 from tdf_jax.evaluation.truth import path_error, pose_error
 from tdf_jax.model import Model
+from tdf_jax.modes import cluster_poses
 from tdf_jax.optimize import OptimizeConfig, Result
 from tdf_jax.solve import SolveConfig
 from tdf_jax.trajectory import Trajectory
@@ -75,6 +76,7 @@ def record(
         "best": result.best,
         "loss": {"start": float(result.losses[result.best, 0]), "end": result.loss},
         "confidence": result.confidence,
+        "modes": [{"pick": _plain(mode.pose), "energy": mode.energy, "share": mode.share} for mode in cluster_poses(result.trajectories[:, 0], result.energies)],
         "errors": errors(trajectory, expected),
         "goal": _plain(trajectory.wxyz_xyz[-1]),
         "expected": None if expected is None else _plain(expected.wxyz_xyz),
@@ -95,17 +97,30 @@ def table(record: dict, out: Path) -> str:
         starts, best = "{inits} starts, {scouts} of the keyframe", "the best candidate of every waypoint"
     else:
         starts, best = "{inits} starts, {iterations} iterations", f"start {record['best'] + 1} of {sizes['inits']}; {record['status']}"
+    parts = ", ".join(f"{name} {value:.1f}" for name, value in seconds.items() if name != "total")
+    pick = path = "n/a (the truth is not known)"
+    if found is not None:
+        pick = f"{100 * found['pick_metres']:.2f} cm, {np.degrees(found['pick_radians']):.1f} degrees"
+        path = f"{100 * found['path_metres']:.2f} cm, mean over waypoints"
     rows = {
         "run": f"{starts}, {{poses}} poses, {{queries}} queries".format(**sizes),
         "loss, start": f"{record['loss']['start']:.5f}",
         "loss, end": f"{record['loss']['end']:.5f} ({best})",
-        "confidence": "n/a" if record["confidence"] is None else f"{record['confidence']:.2f} that the pick is right to 2 cm and 20 degrees",
+        "solutions": _solutions(record["modes"]),
         "pick-pose error": pick,
         "path error": path,
         "time": f"{seconds['total']:.1f} s ({parts})",
         "written to": str(out),
     }
+    if record["confidence"] is not None:
+        rows["confidence"] = f"{record['confidence']:.2f} that the pick is right to 2 cm and 20 degrees"
     return "\n".join(f"{name:<17}{value}" for name, value in rows.items())
+
+
+def _solutions(modes: list[dict]) -> str:
+    """How many distinct picks there are, and how far behind the second is."""
+    told = f"{len(modes)} distinct pick{'s' if len(modes) != 1 else ''}"
+    return told if len(modes) < 2 else f"{told}; the second's loss is {modes[1]['energy']:.5f}"
 
 
 def _plain(value):

@@ -155,6 +155,8 @@ def _check_numbers(settings: SceneSettings) -> None:
     if isinstance(settings, Settings):
         if settings.k is not None and settings.method == "carry":
             raise InputError("tdf imitate: --k is a weight of eq. 3, which --method carry does not minimise; drop it, or add --method gauss-newton or adam")
+        if settings.inits is not None and settings.inits < 1:
+            raise InputError(f"tdf imitate: --inits is {settings.inits}; expected at least 1")
         if settings.k is not None and not 0 <= settings.k < np.inf:
             raise InputError(f"tdf imitate: --k is {settings.k}; expected a weight of 0 or more")
         if not np.isfinite(settings.goal_offset).all():
