@@ -13,7 +13,7 @@ from tdf_jax.paths import SHAPES
 
 
 def scene(seed: int, body):
-    """A path of 12 poses and three boxes that the body hits on the way, not at the ends; seeds without one are drawn again."""
+    """A path of 12 poses and three boxes, one or more of which the body hits on the way and none at the ends; others are drawn again."""
     rng = np.random.default_rng(seed)
     while True:
         path = list(SHAPES.values())[rng.integers(3)](12, (0, 0, 0), (0, 0.4, 0), rotation=(0, 1, 0, 0))
@@ -34,6 +34,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", type=int, default=50)
     count = parser.parse_args().scenes
+    if count < 1:
+        parser.error(f"--scenes is {count}; expected at least 1")
     body = tdf.gripper_query(jax.random.key(0), 300)
     rows = []
     for seed in range(count):
@@ -47,7 +49,10 @@ def main() -> None:
             print(f"scene {seed}: {cleared.status}", flush=True)
     clear, checked, longer, seconds = np.array(rows).T
     clear = clear > 0
-    print(f"clear {clear.sum()} of {count}; least clearance of those by 100 looks a segment {1e3 * checked[clear].min():.2f} mm")
+    print(f"clear {clear.sum()} of {count}")
+    if not clear.any():
+        return
+    print(f"least clearance of those by 100 looks a segment {1e3 * checked[clear].min():.2f} mm")
     print(f"length added: median {np.median(longer[clear]):.1%}, largest {longer[clear].max():.1%}")
     print(f"seconds: median {np.median(seconds):.2f}, largest {seconds.max():.2f}, first {seconds[0]:.2f}")
 

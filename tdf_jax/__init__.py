@@ -2,9 +2,9 @@
 
 from tdf_jax.carry import CarryConfig, carry, carry_trajectory
 from tdf_jax.checkpoint import available_models, load_model, save_model
-from tdf_jax.convert import convert_checkpoint
 from tdf_jax.clearance import ClearanceConfig, clearance, push_clear
 from tdf_jax.confidence import confidence
+from tdf_jax.convert import convert_checkpoint
 from tdf_jax.demonstration import Demonstration, Reference, describe
 from tdf_jax.descriptor import pose_descriptor, trajectory_descriptor
 from tdf_jax.energy import (

@@ -27,18 +27,40 @@ from tdf_jax.trajectory import Trajectory
 
 @dataclasses.dataclass(frozen=True)
 class CarryConfig:
-    """Settings of `carry`.
+    """Settings of `carry`: those of the solver that finds the pick.
 
     Attributes:
-        pick: of the solver that finds the pick; its finalists are the rows of the result. They are polished to their minima, so that they tell how many
-            distinct solutions there are: after the solver's usual 4 steps some are still 5 to 90 degrees from theirs.
+        scouts: random starts.
+        finalists: candidates that are kept to the end, the rows of the result; several may come to one pose, see `cluster_poses`.
+        points: query points that all stages but the last see, drawn at random from all.
+        steps: most steps of the four stages: from all scouts, from the best quarter of them, of the finalists, and of these with all query points. The last are many, so
+            that the finalists tell how many distinct solutions there are: after four some are 5 to 90 degrees from their minima.
+        tolerance, start, start_radius, chunk: see `SolveConfig`.
     """
 
-    pick: SolveConfig = SolveConfig(finalists=5, steps=(6, 10, 6, 4, 6, 24))
+    scouts: int = 64
+    finalists: int = 5
+    points: int = 16
+    steps: tuple[int, int, int, int] = (6, 10, 6, 24)
+    tolerance: float = 1e-3
+    start: str = "carried"
+    start_radius: float = 0.1
+    chunk: int | None = None
 
     def __post_init__(self):
-        if not isinstance(self.pick, SolveConfig):
-            raise InputError(f"CarryConfig(): pick is {self.pick!r}; expected a SolveConfig")
+        if not isinstance(self.steps, tuple) or len(self.steps) != 4:
+            raise InputError(f"CarryConfig(): steps is {self.steps!r}; expected a tuple of four whole numbers of at least 1")
+        try:
+            self.solver
+        except InputError as error:
+            raise InputError(str(error).replace("SolveConfig()", "CarryConfig()").replace("six", "four")) from None
+
+    @property
+    def solver(self) -> SolveConfig:
+        """The solver's settings: of one waypoint it makes no search of whole trajectories, and carries none."""
+        scout, halve, refine, polish = self.steps
+        settings = {name: getattr(self, name) for name in ("scouts", "finalists", "points", "tolerance", "start", "start_radius", "chunk")}
+        return SolveConfig(inits=1, steps=(scout, halve, 1, 1, refine, polish), **settings)
 
 
 def carry_trajectory(demonstrated: Trajectory, pick: Float[Array, "7"], goal: Float[Array, "7"] | None) -> Trajectory:
@@ -56,6 +78,7 @@ def carry_trajectory(demonstrated: Trajectory, pick: Float[Array, "7"], goal: Fl
     Returns:
         The trajectory, T_world_query.
     """
+    pick, goal = jnp.asarray(pick), None if goal is None else jnp.asarray(goal)
     pick_motion = poses.compose(pick, poses.inverse(demonstrated.wxyz_xyz[0]))
     if goal is None:
         return demonstrated.transformed(pick_motion)
@@ -85,28 +108,32 @@ def carry(
         reference: the demonstration's.
         key: random key of the starts.
         goal: last pose, T_world_query; by default, if it is kept, the demonstration's, carried by the centroids.
-        fix_last: end at the goal; without, and without a goal, the demonstration is carried rigidly with the pick.
+        fix_last: end at the goal; without, the demonstration is carried rigidly with the pick.
         config: settings.
         progress, mesh: see `solve`.
 
     Returns:
-        A result whose rows are the distinct picks that the solver ended with, each with its trajectory; losses and energies are those of the picks' descriptors.
+        A result whose rows are the picks that the solver's finalists came to, each with its trajectory; losses and energies are those of the picks' descriptors.
 
     Raises:
-        InputError: as for `solve`.
+        InputError: as for `solve`, or a goal that fix_last=False would not keep.
     """
     check_key("carry()", key)
+    if not isinstance(config, CarryConfig):
+        raise InputError(f"carry(): config is {config!r}; expected a CarryConfig")
     if fix_last and reference.trajectory.poses == 1:
         raise InputError("carry(): the trajectory has one pose and fix_last keeps it; expected fix_last=False")
-    if goal is None and fix_last:
-        goal = default_goal(field, reference)
-    if goal is not None:
+    if goal is not None and not fix_last:
+        raise InputError("carry(): there is a goal, and fix_last=False does not keep it; drop one of them")
+    if fix_last:
+        goal = default_goal(field, reference) if goal is None else goal
         check_goal("carry()", goal)
         goal = jnp.asarray(goal)
     picked = Reference(reference.descriptors[:1], Trajectory(reference.trajectory.wxyz_xyz[:1]), reference.query)
-    result = solve(field, picked, key, fix_last=False, energy=EnergyWeights(0.0), config=config.pick, progress=progress, mesh=mesh)
+    result = solve(field, picked, key, fix_last=False, energy=EnergyWeights(0.0), config=config.solver, progress=progress, mesh=mesh)
     trajectories, starts = (_carried(reference.trajectory, part[:, 0], goal) for part in (result.trajectories, result.starts))
-    return dataclasses.replace(result, trajectories=trajectories, starts=starts, confidence=confidence(residual(result, picked)))
+    left = residual(result.loss, picked.descriptors[0]) if result.finite.any() else float("nan")
+    return dataclasses.replace(result, trajectories=trajectories, starts=starts, residual=left, confidence=confidence(left))
 
 
 @jax.jit

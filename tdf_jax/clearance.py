@@ -153,7 +153,7 @@ def push_clear(
     What is required is the margin, from each obstacle; near an end that is closer to it than that, what the end keeps plus the way from there
     (`ramp`). A trajectory that keeps it already comes back as it is. Otherwise the smoothest small deviation (shifts, and turns about the
     middle of the body) that keeps it is sought from the given path and from detours to all sides of it: the other side of a wall is
-    another minimum. Of those that come out clear the one with the least bending and deviation is taken. No draw is made: the result is
+    another minimum. The four of least cost are measured with the whole body, and the first of them that is clear is taken. No draw is made: the result is
     a function of the input, and moves with the scene.
 
     One program is compiled for each number of poses, body points and obstacles of a kind, and coarseness of the looks.
@@ -197,7 +197,7 @@ def push_clear(
     short = excess(rows)
     deep = [(name, int(order[i]), ends[end, i]) for end, name in enumerate(("first", "last")) for i in range(len(order)) if ends[end, i] < -config.contact]
     if short.min() >= -ROUNDING:
-        return _said(trajectory, found, short, 0.0, deep, config, True, margin)
+        return _said(trajectory, found, short, 0.0, deep, True)
     clear, rest = [], [(wxyz_xyz, found, short)]
     if len(wxyz_xyz) > 2:
         looks = _looks(wxyz_xyz, body, LOOK)
@@ -225,16 +225,16 @@ def push_clear(
     # They come in the order of their costs.
     wxyz_new, found, short = clear[0] if clear else max(rest, key=lambda candidate: candidate[2].min())
     moved = np.linalg.norm(_middles(wxyz_new, body) - _middles(wxyz_xyz, body), axis=1).max()
-    return _said(Trajectory(jnp.asarray(wxyz_new)), found, short, float(moved), deep, config, bool(clear), margin)
+    return _said(Trajectory(jnp.asarray(wxyz_new)), found, short, float(moved), deep, bool(clear))
 
 
-def _said(trajectory, found, short, deviation, deep, config, kept, margin):
+def _said(trajectory, found, short, deviation, deep, kept):
     """`Cleared`, with the status in words."""
     if deep:
         name, obstacle, distance = deep[0]
         status = (
             f"not clear: the {name} pose is {-distance:.3f} m inside of obstacle {obstacle}, which no push between the ends can change; "
-            f"move that end, or allow it with ClearanceConfig(contact={-distance:.3f})"
+            f"move that end, or allow it with ClearanceConfig(contact={np.ceil(-1e3 * distance) / 1e3:.3f})"
         )
     elif kept:
         status = "already clear: unchanged" if deviation == 0 else f"clear: moved by up to {deviation:.3f} m"

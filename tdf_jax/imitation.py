@@ -1,5 +1,6 @@
 """Imitation, the whole way in one call: demonstration + new object's cloud -> trajectory."""
 
+import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 
 import jax
@@ -7,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from tdf_jax.carry import CarryConfig, carry
+from tdf_jax.confidence import CALIBRATED
 from tdf_jax.demonstration import Demonstration, Reference, describe
 from tdf_jax.energy import EnergyWeights
 from tdf_jax.errors import InputError
@@ -44,7 +46,8 @@ def imitate(
         key: random key, such as `jax.random.key(0)`; the result is a function of it.
         goal: last pose, T_world_query as `wxyz_xyz`; by default, if it is kept, the demonstration's last pose, carried by the centroids.
         goal_offset: world vector added to the goal's translation, metres.
-        fix_last: keep the last pose at the goal; without, and without a goal, all poses are found alike, such as the one pose of a grasp.
+        fix_last: keep the last pose at the goal. Without, such as for the one pose of a grasp, the demonstration is carried rigidly with the pick; or, with other configs, all
+            poses are found alike, and a goal is where the last one starts.
         energy: weights of eq. 3's terms, by default the paper's; only with a `config` that minimises it.
         config: settings of `carry`; or of `solve`; or, for Adam as in the paper and for energies with eq. 6, of `optimize`.
         progress, mesh: see `solve` and `optimize`.
@@ -68,7 +71,8 @@ def imitate(
         goal = goal + jnp.pad(_finite("goal_offset", goal_offset, (3,)), (4, 0))
     settings = {"goal": goal, "fix_last": fix_last, "progress": progress, "mesh": mesh}
     if isinstance(config, CarryConfig):
-        return carry(field, reference, key, config=config, **settings)
+        result = carry(field, reference, key, config=config, **settings)
+        return result if model.info.name in CALIBRATED else dataclasses.replace(result, confidence=None)
     minimise = optimize if isinstance(config, OptimizeConfig) else solve
     return minimise(field, reference, key, energy=EnergyWeights() if energy is None else energy, config=config, **settings)
 

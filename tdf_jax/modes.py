@@ -162,6 +162,8 @@ class PoseCovariance:
         Where several are free, any mixture of them is as free.
         """
         values = np.asarray(self.values)
+        if values.ndim != 1:
+            raise InputError(f"PoseCovariance.free: there is a batch of shape {values.shape[:-1]}; expected one pose. Take one by jax.tree.map(lambda part: part[i], ...)")
         bound = max(FREE * values[-1], float(_least_value(self.scale, self.lever)))
         return np.asarray(self.directions)[values <= bound]
 

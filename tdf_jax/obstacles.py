@@ -154,6 +154,8 @@ def mesh_obstacle(mesh: "trimesh.Trimesh", pitch: float = 0.01, pad: float = 0.0
             installed.
     """
     igl = libigl("mesh_obstacle()")
+    if not (hasattr(mesh, "vertices") and hasattr(mesh, "faces")):
+        raise InputError(f"mesh_obstacle(): mesh is a {type(mesh).__name__}; expected a trimesh.Trimesh, such as tdf.load_mesh(path)")
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
     if len(faces) == 0 or not np.isfinite(vertices).all():
         raise InputError(f"mesh_obstacle(): the mesh has {len(faces)} faces, or vertices that are not finite; expected a surface")

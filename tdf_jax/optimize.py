@@ -71,7 +71,7 @@ class OptimizeConfig:
 
 
 @functools.partial(
-    jax.tree_util.register_dataclass, data_fields=["trajectories", "losses", "energies", "starts", "confidence"], meta_fields=[]
+    jax.tree_util.register_dataclass, data_fields=["trajectories", "losses", "energies", "starts", "residual", "confidence"], meta_fields=[]
 )
 @dataclasses.dataclass(frozen=True)
 class Result:
@@ -82,13 +82,15 @@ class Result:
         losses: (inits, iterations), the energy before each step; the first column is the start's.
         energies: (inits,), the energy of `trajectories`, after the last step.
         starts: (inits, poses, 7), where they began.
-        confidence: of `carry`: how likely the pick is right, in [0, 1], see `tdf_jax.confidence`; None of others.
+        residual: of `carry`: what the best pick leaves of the demonstration's descriptors, see `tdf_jax.confidence`; None of others.
+        confidence: of `carry`: how likely the pick is right, in [0, 1], see there; None of others, and of `imitate` with weights that it is not calibrated for.
     """
 
     trajectories: Float[Array, "inits poses 7"]
     losses: Float[Array, "inits iterations"]
     energies: Float[Array, "inits"]
     starts: Float[Array, "inits poses 7"]
+    residual: float | None = None
     confidence: float | None = None
 
     @property
@@ -105,7 +107,7 @@ class Result:
         """
         if not self.finite.any():
             raise InputError(
-                f"Result.best: {self.status}; lower rotation_rate and translation_rate, or check the weights and the query points"
+                f"Result.best: {self.status}; check the weights and the query points, or, with Adam, lower rotation_rate and translation_rate"
             )
         return int(np.argmin(np.where(self.finite, self.energies, np.inf)))
 

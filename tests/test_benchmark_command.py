@@ -1,19 +1,19 @@
 """`tdf benchmark` and its pictures."""
 
-import dataclasses
 import json
 import re
+import shlex
 import shutil
 import typing
 
 import matplotlib
-import matplotlib.collections
+import matplotlib.figure
 import numpy as np
 import pytest
 
 from tdf_jax.benchmark.reliability import bins
 from tdf_jax.benchmark.scores import Score, by_method
-from tdf_jax.benchmark.task import make_task
+from tdf_jax.benchmark.task import make_task, mesh_index
 from tdf_jax.cli.benchmark import Cloud
 from tdf_jax.cli.main import main
 from tdf_jax.evaluation.cases import mug_case
@@ -101,7 +101,13 @@ def test_errors_of_a_copy_are_those_by_hand(folder):
 
 def test_the_page_tells_the_command_that_made_it(folder, weights):
     assert f"`tdf benchmark --weights {weights} --pairs 2 --seed 0 --height 0.12 --clouds full" in told(folder)
-    assert "--methods copy centroids tdf_jax" in told(folder)
+    assert "demonstrations" not in told(folder).split("`")[1]
+
+
+def test_the_methods_are_told_as_a_shell_takes_them(everything):
+    words = shlex.split(told(everything).split("`")[1])
+    after = words[words.index("--methods") + 1 :]
+    assert after[: [word.startswith("--") for word in [*after, "--"]].index(True)] == [*METHODS, "oracle correspondences"]
 
 
 def test_the_path_of_the_page_is_printed(folder, weights, capsys):
@@ -114,8 +120,10 @@ def test_run_again_it_computes_nothing_and_writes_the_same(folder, weights, monk
     monkeypatch.setattr("tdf_jax.benchmark.methods.Attempts.of", lambda *_: pytest.fail("computed again"))
     for name in ("benchmark.md", "benchmark.json", "truth.png"):
         (again / name).unlink()
-    run("--weights", weights, "--pairs", 2, "--methods", *reversed(METHODS), "copy", "--out", again)
+    run("--weights", weights, *PLAIN, "--out", again)
     assert tree(again) == tree(folder)
+    run("--weights", weights, "--pairs", 2, "--methods", *reversed(METHODS), "copy", "--out", again)
+    assert (read(again)["tasks"], read(again)["rows"]) == (read(folder)["tasks"], read(folder)["rows"])
 
 
 def test_a_damaged_file_of_an_earlier_run_is_told(folder, weights, tmp_path, capsys):
@@ -147,13 +155,13 @@ def everything(folder, weights, real, tmp_path_factory):
     return out
 
 
-def test_clouds_meshes_and_demonstrations_add_to_what_there_was(folder, everything):
+def test_clouds_meshes_and_demonstrations_add_to_what_there_was(folder, everything, real):
     record, before = read(everything), read(folder)
     kinds = [(one["clouds"], one["instance"], one["task"], one["method"]) for one in record["tasks"]]
     expected = [
         (clouds, name, index, method)
         for clouds in ("full", "noise")
-        for name, index in (("mug 0", 0), ("mug 1", 1), ("cup", 0), ("cup", 1))
+        for name, index in (("mug 0", 0), ("mug 1", 1), ("cup", mesh_index("cup", 0)), ("cup", mesh_index("cup", 1)))
         for method in (*METHODS, "oracle correspondences")
         if (name, method) != ("cup", "oracle correspondences")
     ]
@@ -161,7 +169,7 @@ def test_clouds_meshes_and_demonstrations_add_to_what_there_was(folder, everythi
     shared = [one for one in record["tasks"] if one["clouds"] == "full" and one["instance"] != "cup" and not one["method"].startswith("oracle")]
     assert shared == before["tasks"]
     assert (everything / "demonstrations.png").read_bytes().startswith(PNG) and "demonstrations.png" in told(everything)
-    assert record["settings"]["meshes"] == "DIR" and "--meshes DIR --poses 2 --demonstrations 1 3" in told(everything)
+    assert record["settings"]["meshes"] == str(real) and f"--meshes {real} --poses 2 --demonstrations 1 3" in told(everything)
 
 
 def test_real_meshes_are_of_their_own_size_with_a_penetration(everything):
@@ -170,18 +178,24 @@ def test_real_meshes_are_of_their_own_size_with_a_penetration(everything):
 
 
 def test_demonstrations_are_of_every_fifth_task_of_all_clouds(everything):
-    """Of four tasks under each condition: the first of the pairs and the first of the mesh."""
+    expected = len([one for one in read(everything)["tasks"] if (one["clouds"], one["method"]) == ("full", "copy") and one["task"] % 5 == 0])
+    assert expected >= 1
     found = read(everything)["demonstrations"]
     assert [(one["clouds"], one["count"], one["way"]) for one in found] == [
         (clouds, count, way) for clouds in ("full", "noise") for count, way in ((1, "mean"), (3, "mean"), (3, "median"))
     ]
-    assert all(len(one["distances"]) == len(one["angles"]) == 2 for one in found)
+    assert all(len(one["distances"]) == len(one["angles"]) == expected for one in found)
 
 
-def test_real_meshes_alone(weights, real, tmp_path):
-    run("--weights", weights, "--pairs", 0, "--meshes", real, "--poses", 1, "--methods", "copy", "--out", tmp_path / "out")
-    (one,) = read(tmp_path / "out")["tasks"]
-    assert one["instance"] == "cup" and not (tmp_path / "out" / "reliability.png").exists()
+def test_real_meshes_alone_with_the_paths_in_turn(weights, real, tmp_path):
+    shutil.copytree(real, two := tmp_path / "two")
+    shutil.copy(two / "cup.obj", two / "mug.obj")
+    (two / "meshes.json").write_text(json.dumps(dict.fromkeys(("cup.obj", "mug.obj"), {"unit": 1, "up": "+z", "handle": "+x"})))
+    run("--weights", weights, "--pairs", 0, "--meshes", two, "--poses", 2, "--methods", "copy", "--out", tmp_path / "out")
+    tasks = read(tmp_path / "out")["tasks"]
+    assert [(one["instance"], one["path"]) for one in tasks] == [(name, path) for name in ("cup", "mug") for path in ("line", "semicircle")]
+    assert [one["task"] for one in tasks] == [mesh_index(name, pose) for name in ("cup", "mug") for pose in (0, 1)]
+    assert not (tmp_path / "out" / "reliability.png").exists()
 
 
 def test_all_methods_is_every_method(weights, tmp_path, monkeypatch):
@@ -229,14 +243,16 @@ def test_pictures_show_every_path_and_goals_where_there_are_enough_tasks(weights
         (("--methods",), "--methods has none; expected all"),
         (("--clouds",), "--clouds is empty; expected at least one condition"),
         (("--clouds", "foggy"), "foggy"),
-        (("--demonstrations", 3, -1), "--demonstrations is (3, -1); expected numbers of at least 1"),
+        (("--demonstrations", 3, -1), "--demonstrations is (3, -1); expected numbers of 1 to 100"),
         (("--demonstrations", 0), "--demonstrations is (0,)"),
+        (("--demonstrations", 101), "--demonstrations is (101,)"),
         (("--weights", "teapot"), "no weights are called 'teapot'"),
         (("--meshes", "missing"), "there is no folder missing"),
     ],
 )
 def test_mistakes_are_told_before_anything_is_written(words, message, weights, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tdf_jax.benchmark.run.run", lambda *_, **__: pytest.fail("the work has begun"))
     if words[0] == "--meshes":
         pytest.importorskip("igl")
     with pytest.raises(SystemExit) as stop:
@@ -262,6 +278,14 @@ def test_a_method_that_can_try_nothing_is_told(weights, real, tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         run("--weights", weights, "--pairs", 0, "--meshes", real, "--poses", 1, "--methods", "oracle correspondences", "--out", tmp_path / "out")
     assert stop.value.code == 2 and "--methods" in capsys.readouterr().err
+
+
+def test_a_page_of_the_users_is_not_overwritten(weights, tmp_path, capsys):
+    (tmp_path / "benchmark.md").write_text("mine")
+    with pytest.raises(SystemExit) as stop:
+        run("--weights", weights, *PLAIN, "--out", tmp_path)
+    assert stop.value.code == 2 and "--out" in capsys.readouterr().err
+    assert tree(tmp_path) == {"benchmark.md": b"mine"}
 
 
 def test_every_condition_can_be_asked_for():
@@ -340,10 +364,10 @@ def test_reliability_is_drawn_from_bins_with_counts_of_right_and_wrong():
     np.testing.assert_allclose(ends, [row["interval"] for row in rows])
     diagonal = steps(rates)["as often as said"]
     np.testing.assert_array_equal(diagonal[:, 0], diagonal[:, 1])
-    drawn = {bars.get_label(): [(bar.get_x(), bar.get_height()) for bar in bars] for bars in counts.containers}
+    drawn = {bars[0].get_label(): [bar.get_height() for bar in bars] for bars in counts.containers}
     for label, truth in (("right", 1), ("wrong", 0)):
         expected = np.histogram(predicted[right == truth], np.linspace(0, 1, 21))[0]
-        np.testing.assert_allclose([height for _, height in drawn[label]], expected)
+        np.testing.assert_allclose(drawn[label], expected)
 
 
 def test_several_demonstrations_are_drawn_for_every_way_from_the_first_on():

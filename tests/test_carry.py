@@ -1,6 +1,7 @@
 """The demonstration carried by both of its ends, and the pick it is carried from."""
 
 import dataclasses
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +11,10 @@ from conftest import composed, random_cloud, random_poses
 from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
-from tdf_jax.confidence import residual
 from tdf_jax.errors import InputError
 
 KEY = jax.random.key(0)
-CONFIG = tdf.CarryConfig(tdf.SolveConfig(scouts=8, points=3, steps=(2, 2, 1, 1, 3, 6), finalists=3))
+CONFIG = tdf.CarryConfig(scouts=8, points=3, steps=(2, 2, 3, 6), finalists=3)
 
 
 def motion_of(new, old):
@@ -108,7 +108,7 @@ def result(field, reference):
 def picked(field, reference):
     """The pick alone, by the solver."""
     alone = dataclasses.replace(reference, descriptors=reference.descriptors[:1], trajectory=tdf.Trajectory(reference.trajectory.wxyz_xyz[:1]))
-    return alone, tdf.solve(field, alone, KEY, fix_last=False, energy=tdf.EnergyWeights(0.0), config=CONFIG.pick)
+    return alone, tdf.solve(field, alone, KEY, fix_last=False, energy=tdf.EnergyWeights(0.0), config=CONFIG.solver)
 
 
 def test_picks_are_those_of_descriptors_alone(result, picked, field):
@@ -129,10 +129,12 @@ def test_rows_are_carried_from_their_picks_to_the_goal(result, reference, field)
         np.testing.assert_allclose(row, expected.wxyz_xyz, atol=1e-5)
 
 
-def test_a_goal_without_fix_last_is_kept_all_the_same_and_none_carries_rigidly(field, reference):
+def test_a_goal_is_where_it_ends_and_without_one_it_is_carried_rigidly(field, reference):
     goal = jnp.asarray(random_poses(3, 1)[0], jnp.float32)
     found = tdf.carry(field, reference, KEY, goal=goal, config=CONFIG).trajectory
     np.testing.assert_allclose(found.translations[-1], goal[4:], atol=1e-5)
+    with pytest.raises(InputError, match="fix_last=False does not keep it"):
+        tdf.carry(field, reference, KEY, goal=goal, fix_last=False, config=CONFIG)
     free = tdf.carry(field, reference, KEY, fix_last=False, config=CONFIG).trajectory
     motion = motion_of(free.wxyz_xyz[0], reference.trajectory.wxyz_xyz[0])
     np.testing.assert_allclose(free.translations, motion[0].apply(np.array(reference.trajectory.translations, float)) + motion[1], atol=1e-5)
@@ -142,8 +144,8 @@ def test_the_confidence_is_that_of_the_best_picks_residual(result, picked):
     alone, solved = picked
     descriptors = np.asarray(alone.descriptors[0], float)
     expected = solved.loss / np.abs(descriptors - descriptors.mean(axis=0)).mean()
-    np.testing.assert_allclose(residual(solved, alone), expected, rtol=1e-5)
-    assert result.confidence == tdf.confidence(residual(solved, alone)) and 0 <= result.confidence <= 1
+    np.testing.assert_allclose(result.residual, expected, rtol=1e-5)
+    assert result.confidence == tdf.confidence(result.residual) and 0 <= result.confidence <= 1
 
 
 def test_one_query_point_has_no_confidence(small_model, field, demonstration):
@@ -158,6 +160,7 @@ def test_one_query_point_has_no_confidence(small_model, field, demonstration):
         ({"goal": np.ones(6)}, "shape"),
         ({"key": 3}, "key"),
         ({"mesh": "all"}, "mesh"),
+        ({"config": tdf.SolveConfig()}, "expected a CarryConfig"),
     ],
 )
 def test_bad_input_is_refused(field, reference, settings, words):
@@ -171,9 +174,34 @@ def test_one_pose_that_is_kept_leaves_nothing_to_find(field, reference):
         tdf.carry(field, one, KEY)
 
 
-def test_settings_are_checked():
-    with pytest.raises(InputError, match="expected a SolveConfig"):
-        tdf.CarryConfig(pick=tdf.OptimizeConfig())
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"scouts": 0}, r"^CarryConfig\(\): scouts is 0"),
+        ({"steps": (1, 2, 3)}, "tuple of four"),
+        ({"steps": (1, 2, 3, 0)}, r"^CarryConfig\(\): steps is .*tuple of four"),
+        ({"tolerance": -1}, r"^CarryConfig\(\): tolerance"),
+    ],
+)
+def test_settings_are_checked(settings, words):
+    with pytest.raises(InputError, match=words):
+        tdf.CarryConfig(**settings)
+
+
+def test_the_calibration_is_for_the_shipped_weights(small_model, reference):
+    """Others have a residual, and `confidence` may be fitted to theirs."""
+    cloud = random_cloud(3).astype(np.float32)
+    result = tdf.imitate(small_model, reference, cloud, key=KEY, config=CONFIG)
+    assert result.confidence is None and result.residual > 0
+    named = dataclasses.replace(small_model, info=dataclasses.replace(small_model.info, name="mug"))
+    assert tdf.imitate(named, reference, cloud, key=KEY, config=CONFIG).confidence == tdf.confidence(result.residual)
+
+
+def test_without_a_finite_start_the_result_says_so(monkeypatch, field, reference, result):
+    lost = dataclasses.replace(result, energies=jnp.full(3, jnp.inf))
+    monkeypatch.setattr(sys.modules["tdf_jax.carry"], "solve", lambda *arguments, **settings: lost)
+    found = tdf.carry(field, reference, KEY, config=CONFIG)
+    assert found.confidence is None and "non-finite" in found.status
 
 
 def test_imitate_carries_unless_told_otherwise(small_model, demonstration, reference, field, result):

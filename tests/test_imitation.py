@@ -113,7 +113,7 @@ def test_progress_is_passed_on(imitate, reference):
         ({"goal": np.zeros(7)}, "quaternion not zero"),
         ({"goal_offset": (0, 1)}, r"goal_offset has shape \(2,\); expected \(3,\)"),
         ({"goal_offset": (0, 1, np.nan)}, "goal_offset is .*expected finite"),
-        ({"config": 100}, "config is 100; expected a SolveConfig or an OptimizeConfig"),
+        ({"config": 100}, "config is 100; expected a CarryConfig, SolveConfig or OptimizeConfig"),
         ({"energy": 0.02}, "energy is 0.02; expected EnergyWeights"),
         ({"energy": 0.02, "config": tdf.SolveConfig()}, r"solve\(\): energy is 0.02; expected EnergyWeights"),
         ({"mesh": jax.devices()}, "mesh is .*expected a jax.sharding.Mesh"),

@@ -24,7 +24,7 @@ from tdf_jax.model import Model, encode, fingerprint
 from tdf_jax.trajectory import Trajectory
 
 FORMAT = 1  # of what is kept
-MUGS = 1_000_000  # demonstrated mugs are numbered from here, apart from those of the tasks
+MUGS, MOST = 1_000_000_000, 100  # demonstrated mugs are numbered from here, apart from those of the tasks; so many a task
 POINTS = 1500
 
 
@@ -47,21 +47,22 @@ def learnt(
     Args:
         makers: each makes a task; its target, its query points and its truth are used.
         model: the network.
-        counts: numbers of demonstrations.
+        counts: numbers of demonstrations, up to `MOST`.
         folder: keeps the picks; it exists.
         seed: of the demonstrated mugs and the starts.
         progress: show a progress bar.
     """
     groups: dict[tuple, list] = {}
-    about = [FORMAT, version("tdf_jax"), fingerprint(model), seed]
-    for make in tqdm(makers if counts else (), desc="demonstrations", unit="task", disable=not progress):
+    counts = tuple(dict.fromkeys(counts))
+    about = [FORMAT, version("tdf_jax"), jax.default_backend(), fingerprint(model), seed]
+    for make in tqdm(makers if counts else (), desc="demonstrations", unit="task", disable=not (progress and counts)):
         task = make()
         if task.index % EVERY:
             continue
         shown = functools.cache(functools.partial(_demonstrations, task, seed, max(counts)))
         for count in counts:
             for way in COMBINATIONS if count > 1 else COMBINATIONS[:1]:
-                what = [*about, task.index, task.case.instance, task.case.clouds, task.case.scale, count, way]
+                what = [*about, *task.identity, count, way]
                 found = kept("tdf benchmark", folder, what, lambda count=count, way=way: _pick(task, model, shown()[:count], way, seed))
                 groups.setdefault((task.case.clouds, count, way), []).append(found)
     return [
@@ -74,7 +75,7 @@ def _demonstrations(task, seed, count) -> list[Demonstration]:
     shown = []
     parameters = task.case.object_a.parameters
     for number in range(count):
-        mug = mug_of(seed, MUGS + 100 * task.index + number, parameters.height)
+        mug = mug_of(seed, MUGS + MOST * task.index + number, parameters.height)
         pose = poses.pose(*(jnp.asarray(part, jnp.float32) for part in (mug.handle_frame[:3, :3], mug.handle_frame[:3, 3])))
         points = sample_surface(mug.mesh, POINTS, number).astype(np.float32)
         shown.append(Demonstration(points, Trajectory(pose[None]), task.demonstration.query))

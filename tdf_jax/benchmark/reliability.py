@@ -5,7 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-EDGES = 0.0, 0.25, 0.5, 0.75, 0.9, 0.97, 0.99, 1.0  # of bins: most picks are sure
+from tdf_jax.errors import InputError
+
+EDGES = 0.0, 0.25, 0.5, 0.75, 0.9, 0.98, 1.0  # of bins: most picks are sure
 
 
 def bins(predicted: Float[np.ndarray, " picks"], right: Float[np.ndarray, " picks"]) -> list[dict]:
@@ -50,8 +52,14 @@ def fit(residual: Float[np.ndarray, " picks"], right: Float[np.ndarray, " picks"
 
     Args:
         residual: of picks.
-        right: 1 where the pick was, else 0; both must occur.
+        right: 1 where the pick was, else 0.
+
+    Raises:
+        InputError: a residual that is not above 0, or picks that are all right or all wrong.
     """
+    residual, right = np.asarray(residual, float), np.asarray(right, float)
+    if not (np.isfinite(residual) & (residual > 0)).all() or len(set(right)) != 2:
+        raise InputError("fit(): expected residuals above 0, some of picks that were right and some of others")
     x = np.stack([np.ones(len(residual)), -np.log(residual)], axis=1)
     weights = np.zeros(2)
     for _ in range(100):

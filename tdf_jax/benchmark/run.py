@@ -5,7 +5,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 import jax
-import numpy as np
 from tqdm import tqdm
 
 from tdf_jax.benchmark.methods import METHODS, Attempt, Attempts, tried
@@ -40,7 +39,7 @@ def run(
     for method in methods:
         if method not in METHODS:
             raise InputError(f"run(): methods has {method!r}; expected some of {', '.join(METHODS)}")
-    about = [FORMAT, version("tdf_jax"), fingerprint(model), seed, inits]
+    about = [FORMAT, version("tdf_jax"), jax.default_backend(), fingerprint(model), seed, inits]
     key = jax.random.key(seed)
     for make in tqdm(makers, desc="benchmark", unit="task", disable=not progress):
         task = make()
@@ -51,8 +50,8 @@ def run(
                 attempt = attempts.of(method)
                 return {} if attempt is None else vars(attempt)
 
-            what = [*about, task.index, task.case.instance, task.case.clouds, task.case.scale, task.goal.tolist(), method]
+            what = [*about, *task.identity, method]
             found = kept("tdf benchmark", folder, what, arrays)
             if found:
-                yield task, method, Attempt(found["trajectories"], found["scores"], float(found["seconds"]), float(found["confidence"]))
+                yield task, method, Attempt(found["trajectories"], found["scores"], float(found["seconds"]), float(found["residual"]))
 

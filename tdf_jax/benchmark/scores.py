@@ -8,12 +8,14 @@ from jaxtyping import Float
 
 from tdf_jax.benchmark.methods import Attempt
 from tdf_jax.benchmark.task import Task
+from tdf_jax.confidence import confidence
 from tdf_jax.evaluation.motion import frechet_distance, jerk, longest_step, penetration
 from tdf_jax.evaluation.summary import RESAMPLES
 from tdf_jax.evaluation.truth import FLIP_DEGREES, pose_error
 from tdf_jax.trajectory import Trajectory
 
 THRESHOLDS = {"1cm_10deg": (0.01, 10.0), "2cm_20deg": (0.02, 20.0), "5cm_30deg": (0.05, 30.0)}  # metres, degrees
+LEAST_JERK = 1e-4  # metres
 MISSED = THRESHOLDS["2cm_20deg"]  # beyond this a pick has failed
 
 
@@ -27,7 +29,7 @@ class Score:
         best_pick: distance and angle of the start whose pick is nearest to the truth (the sum of both over 1 cm and 10 degrees).
         best_path: mean distance of waypoints of the start whose path is nearest to the truth.
         frechet: discrete Frechet distance to the expected path.
-        jerk: of the path, over the expected path's.
+        jerk: of the path, over the expected path's, which is taken as 0.1 mm if it is less.
         longest_step: over the mean step; the expected path's is in `expected_step`.
         penetration: share of query points in the object's clay more than on the expected path; None where the object has no inside.
         starts: how many there were.
@@ -66,10 +68,13 @@ class Score:
 
 def score(method: str, attempt: Attempt, task: Task) -> Score:
     """Measure an attempt against a task's truth."""
-    distance, angle = pose_error(attempt.trajectories, task.expected.wxyz_xyz)
+    # What is not finite counts as the demonstration where it was shown; a row like that is not chosen while another is finite.
+    shown = np.asarray(task.demonstration.trajectory.wxyz_xyz)
+    trajectories = np.where(attempt.finite[:, None, None], attempt.trajectories, shown)
+    distance, angle = pose_error(trajectories, task.expected.wxyz_xyz)
     angle = np.degrees(angle)
     best, nearest = attempt.best, int(np.argmin(distance[:, 0] / 0.01 + angle[:, 0] / 10.0))
-    chosen = Trajectory(attempt.trajectories[best])
+    chosen = Trajectory(trajectories[best])
     places, truth = np.asarray(chosen.translations), np.asarray(task.expected.translations)
     inside = [penetration(path, np.asarray(task.demonstration.query), task.case.object_b, task.case.T_world_b) for path in (chosen, task.expected)]
     return Score(
@@ -84,13 +89,13 @@ def score(method: str, attempt: Attempt, task: Task) -> Score:
         best_pick=(float(distance[nearest, 0]), float(angle[nearest, 0])),
         best_path=float(distance[:, :-1].mean(axis=1).min()),
         frechet=frechet_distance(places, truth),
-        jerk=jerk(places) / max(jerk(truth), 1e-4),
+        jerk=jerk(places) / max(jerk(truth), LEAST_JERK),
         longest_step=longest_step(places),
         expected_step=longest_step(truth),
-        penetration=None if inside[0] is None else inside[0] - inside[1],
+        penetration=None if None in inside else inside[0] - inside[1],
         starts=len(attempt.scores),
         seconds=attempt.seconds,
-        confidence=attempt.confidence if np.isfinite(attempt.confidence) else None,
+        confidence=confidence(attempt.residual),
     )
 
 

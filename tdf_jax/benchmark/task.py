@@ -1,6 +1,7 @@
 """Tasks of the benchmark: a trajectory shown on one object, to be imitated on another, with a goal and the truth."""
 
 import dataclasses
+import zlib
 
 import jax
 import numpy as np
@@ -17,9 +18,10 @@ from tdf_jax.paths import PATHS
 from tdf_jax.query import box_query
 from tdf_jax.trajectory import Trajectory
 
-# How far the goal is moved from the demonstration's last pose carried by the centroids; "opposite" is as far behind the pick as that lies ahead of it.
+# How far the goal is moved from the demonstration's last pose carried by the centroids; "opposite" is as far behind the carried pick as that lies ahead of it.
 DISPLACEMENTS = {"none": 0.0, "10 cm": 0.1, "30 cm": 0.3, "opposite": None}
 POSES = 7
+MESHES = 24_000_000  # tasks on real meshes are numbered from here
 QUERY_STREAM = 0x9E57  # folded into the key of query points
 
 
@@ -44,6 +46,12 @@ class Task:
     demonstration: Demonstration
     goal: Float[np.ndarray, "7"]
     expected: Trajectory
+
+    @property
+    def identity(self) -> list:
+        """What sets it apart from all other tasks, as JSON has it."""
+        truth = [*self.goal.tolist(), *np.asarray(self.expected.wxyz_xyz[0]).tolist()]
+        return [self.index, self.case.instance, self.case.clouds, self.case.scale, self.path, *truth]
 
 
 def make_task(case: Case, seed: int, index: int) -> Task:
@@ -72,6 +80,17 @@ def make_task(case: Case, seed: int, index: int) -> Task:
     goal[4:] += case.points_b.mean(axis=0) - case.points_a.mean(axis=0) + moved
     expected = expected_trajectory(shown.trajectory, case.T_world_place_a, case.T_world_place_b, goal)
     return Task(index, case, path, displacement, shown, goal, expected)
+
+
+def mesh_index(name: str, pose: int) -> int:
+    """Index of the task on a real mesh in one of its poses: apart from those of generated mugs, and the same whatever other meshes there are.
+
+    Meshes begin the turns of goals at different places, so that few poses of each still are of all goals.
+    """
+    number, paths = zlib.crc32(name.encode()), len(PATHS)
+    displacement = (number + pose + pose // paths) % len(DISPLACEMENTS)
+    turn = paths * len(DISPLACEMENTS)
+    return MESHES + turn * (1000 * (number % 1000) + pose // turn) + paths * displacement + pose % paths
 
 
 def carried_by(task: Task, T_b_a: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 7"]:

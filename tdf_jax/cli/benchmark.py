@@ -37,7 +37,7 @@ def benchmark(
         height: of generated mugs, metres.
         clouds: how the new object is seen; see docs/evaluation.md.
         methods: some of those on the page, by their names there, or all.
-        inits: random starts of each method.
+        inits: random starts of Adam and ICP; the library's own solver takes 64 cheap ones.
         meshes: folder of real mugs and their meshes.json; see docs/evaluation.md.
         poses: random poses of each real mug.
         demonstrations: also measure picks learnt from so many demonstrations, such as 1 3 5 10.
@@ -49,6 +49,7 @@ def benchmark(
     from tdf_jax.benchmark.run import run
     from tdf_jax.benchmark.scores import score
     from tdf_jax.checkpoint import load_model
+    from tdf_jax.errors import InputError
     from tdf_jax.evaluation.annotated import load_annotated
     from tdf_jax.files import replace_file
     from tdf_jax.meshes import libigl
@@ -62,9 +63,11 @@ def benchmark(
     folder = _folder(out)
     makers = [make for condition in dict.fromkeys(clouds) for make in _makers(pairs, seed, height, condition, targets, poses)]
     scores = [score(method, attempt, task) for task, method, attempt in run(makers, model, names, folder, seed=seed, inits=inits)]
+    if not scores:
+        raise InputError("tdf benchmark: none of --methods can be tried on these objects; the oracle needs generated mugs, and variants some of every fifth task")
     settings = {
-        "weights": weights, "pairs": pairs, "seed": seed, "height": height, "clouds": clouds, "inits": inits,
-        "meshes": None if meshes is None else "DIR", "poses": poses, "demonstrations": demonstrations,
+        "weights": weights, "pairs": pairs, "seed": seed, "height": height, "clouds": clouds, "methods": methods, "inits": inits,
+        "meshes": None if meshes is None else str(meshes), "poses": poses, "demonstrations": demonstrations,
     }  # fmt: skip
     picks = learnt(makers, model, demonstrations, folder, seed=seed)
     extras = sections(scores, picks)
@@ -75,14 +78,14 @@ def benchmark(
 
 
 def _makers(pairs, seed, height, clouds, targets, poses) -> list[Callable]:
-    from tdf_jax.benchmark.task import make_task
+    from tdf_jax.benchmark.task import make_task, mesh_index
     from tdf_jax.evaluation.cases import mesh_case, mug_case
 
     def generated(index):
         return make_task(mug_case(seed, index, height=height, clouds=clouds), seed, index)
 
     def real(number, pose):
-        return make_task(mesh_case(seed, pose, targets[number], clouds=clouds), seed, number * poses + pose)
+        return make_task(mesh_case(seed, pose, targets[number], clouds=clouds), seed, mesh_index(targets[number].name, pose))
 
     meshes = [functools.partial(real, number, pose) for number in range(len(targets)) for pose in range(poses)]
     return [functools.partial(generated, index) for index in range(pairs)] + meshes
@@ -111,6 +114,8 @@ def _folder(out: Path) -> Path:
     """The folder of what was computed, made now: an hour of work is lost where it cannot be."""
     from tdf_jax.errors import InputError
 
+    if (out / PAGE).exists() and not (out / RECORD).exists():
+        raise InputError(f"tdf benchmark: {out / PAGE} is not of an earlier benchmark, there is no {RECORD} beside it; expected another --out: nothing of yours is overwritten")
     try:
         (out / RUNS).mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -119,6 +124,7 @@ def _folder(out: Path) -> Path:
 
 
 def _check(pairs, seed, height, clouds, methods, inits, meshes, poses, demonstrations) -> None:
+    from tdf_jax.benchmark.demonstrations import MOST
     from tdf_jax.benchmark.methods import METHODS
     from tdf_jax.errors import InputError
 
@@ -134,4 +140,4 @@ def _check(pairs, seed, height, clouds, methods, inits, meshes, poses, demonstra
     need(clouds, "--clouds is empty; expected at least one condition, such as full")
     unknown = [name for name in methods if name not in (*METHODS, "all")]
     need(methods and not unknown, f"--methods has {', '.join(map(repr, unknown)) or 'none'}; expected all, or some of {', '.join(map(repr, METHODS))}")
-    need(all(count >= 1 for count in demonstrations), f"--demonstrations is {demonstrations}; expected numbers of at least 1")
+    need(all(1 <= count <= MOST for count in demonstrations), f"--demonstrations is {demonstrations}; expected numbers of 1 to {MOST}")

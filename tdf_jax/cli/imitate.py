@@ -1,7 +1,6 @@
 """`tdf imitate`: the main job, from files or a pair of generated mugs to a folder of results."""
 
 import contextlib
-import dataclasses
 import json
 import time
 from collections.abc import Iterator
@@ -87,13 +86,13 @@ def _config(settings: Settings) -> CarryConfig | SolveConfig | OptimizeConfig:
         raise InputError("tdf imitate: --iterations is for --method adam; drop one or add the other")
     if settings.method == "gauss-newton":
         return SolveConfig(**starts)
-    return CarryConfig(dataclasses.replace(CarryConfig().pick, **({} if settings.inits is None else {"scouts": settings.inits})))
+    return CarryConfig() if settings.inits is None else CarryConfig(scouts=settings.inits)
 
 
 def _steps(config: CarryConfig | SolveConfig | OptimizeConfig) -> int:
     if isinstance(config, OptimizeConfig):
         return config.iterations
-    return sum((config.pick if isinstance(config, CarryConfig) else config).steps)
+    return sum((config.solver if isinstance(config, CarryConfig) else config).steps)
 
 
 def _draw(folder: Path, scene: Scene, result: Result, rows: str) -> None:

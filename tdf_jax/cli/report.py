@@ -18,7 +18,7 @@ from tdf_jax.optimize import OptimizeConfig, Result
 from tdf_jax.solve import SolveConfig
 from tdf_jax.trajectory import Trajectory
 
-SCHEMA = 1  # raised when a field of result.json changes its meaning or goes
+SCHEMA = 2  # raised when a field of result.json changes its meaning or goes
 RESULT = "result.json"
 NAMES = (RESULT, "trajectory.npz", "trajectory.tum", "imitation.png", "loss.png")
 
@@ -76,7 +76,7 @@ def record(
         "best": result.best,
         "loss": {"start": float(result.losses[result.best, 0]), "end": result.loss},
         "confidence": result.confidence,
-        "modes": [{"pick": _plain(mode.pose), "energy": mode.energy, "share": mode.share} for mode in cluster_poses(result.trajectories[:, 0], result.energies)],
+        "modes": _modes(config, result),
         "errors": errors(trajectory, expected),
         "goal": _plain(trajectory.wxyz_xyz[-1]),
         "expected": None if expected is None else _plain(expected.wxyz_xyz),
@@ -90,8 +90,8 @@ def table(record: dict, out: Path) -> str:
     """The record in a few lines."""
     found, seconds = record["errors"], record["seconds"]
     optimiser = record["optimiser"]
-    sizes = record["demonstration"] | optimiser.get("pick", optimiser)
-    if "pick" in optimiser:
+    sizes = record["demonstration"] | optimiser
+    if record["modes"] is not None:
         starts, best = "{scouts} starts of the pick", "of the best pick"
     elif "scouts" in sizes:
         starts, best = "{inits} starts, {scouts} of the keyframe", "the best candidate of every waypoint"
@@ -106,15 +106,24 @@ def table(record: dict, out: Path) -> str:
         "run": f"{starts}, {{poses}} poses, {{queries}} queries".format(**sizes),
         "loss, start": f"{record['loss']['start']:.5f}",
         "loss, end": f"{record['loss']['end']:.5f} ({best})",
-        "solutions": _solutions(record["modes"]),
         "pick-pose error": pick,
         "path error": path,
         "time": f"{seconds['total']:.1f} s ({parts})",
         "written to": str(out),
     }
+    if record["modes"] is not None:
+        rows["solutions"] = _solutions(record["modes"])
     if record["confidence"] is not None:
         rows["confidence"] = f"{record['confidence']:.2f} that the pick is right to 2 cm and 20 degrees"
     return "\n".join(f"{name:<17}{value}" for name, value in rows.items())
+
+
+def _modes(config, result) -> list[dict] | None:
+    """The distinct picks; None for methods that do not bring them to their minima."""
+    if not isinstance(config, CarryConfig):
+        return None
+    modes = cluster_poses(result.trajectories[:, 0], result.energies)
+    return [{"pick": _plain(mode.pose), "energy": mode.energy, "share": mode.share} for mode in modes]
 
 
 def _solutions(modes: list[dict]) -> str:
