@@ -62,8 +62,17 @@ def record(scores: Sequence[Score], model: Model, settings: Mapping[str, Any], e
         "machine": {"jax": jax.__version__, "backend": jax.default_backend()},
         "rows": rows,
         **extras,
-        "tasks": [dataclasses.asdict(one) for one in scores],
+        "tasks": [_rounded(dataclasses.asdict(one)) for one in scores],
     }
+
+
+def _rounded(value):
+    """Numbers to a micrometre and a millionth of a degree."""
+    if isinstance(value, dict):
+        return {name: _rounded(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(one) for one in value]
+    return round(value, 6) if isinstance(value, float) else value
 
 
 def sections(scores: Sequence[Score], picks: Sequence[Learnt]) -> dict[str, Any]:

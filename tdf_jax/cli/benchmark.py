@@ -72,7 +72,7 @@ def benchmark(
     picks = learnt(makers, model, demonstrations, folder, seed=seed)
     extras = sections(scores, picks)
     _draw(out, makers, scores, extras)
-    replace_file("tdf benchmark", out / RECORD, (json.dumps(record(scores, model, settings, extras), indent=1, allow_nan=False) + "\n").encode())
+    replace_file("tdf benchmark", out / RECORD, (json.dumps(record(scores, model, settings, extras), allow_nan=False) + "\n").encode())
     replace_file("tdf benchmark", out / PAGE, page(scores, model, settings, extras).encode())
     print(out / PAGE)
 
