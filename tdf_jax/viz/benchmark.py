@@ -23,7 +23,7 @@ def truth_figure(tasks: Sequence[Task]) -> Figure:
         view = View(task.case.points_b, triangles_of(mesh), task.expected, None, task.demonstration.trajectory)
         moved = "" if task.displacement == "none" else f", goal {'opposite' if task.displacement == 'opposite' else 'moved by ' + task.displacement}"
         views.append((task.path.replace("_", " ") + moved, view))
-    return panels(views, 3, bounds(np.asarray(tasks[0].demonstration.query)), tasks[0].expected.poses)
+    return panels(views, 3, bounds(np.asarray(tasks[0].demonstration.query)), tasks[0].expected.poses, share=0.78)
 
 
 def errors_figure(scores: Sequence[Score], bold: str) -> Figure:
@@ -35,7 +35,7 @@ def errors_figure(scores: Sequence[Score], bold: str) -> Figure:
     """
     groups = by_method(scores)
     with matplotlib.rc_context(STYLE):
-        figure = blank_figure(WIDTH, 3.6, layout="constrained")
+        figure = blank_figure(WIDTH, 4.2, layout="constrained")
         both = figure.subplots(1, 2, sharey=True)
         for axes, name, error in zip(both, ("pick", "path"), (lambda one: one.distances[0], lambda one: one.path_error)):
             for index, (method, several) in enumerate(groups.items()):
@@ -50,7 +50,7 @@ def errors_figure(scores: Sequence[Score], bold: str) -> Figure:
             axes.grid(alpha=0.25, lw=0.5)
         both[0].set_ylabel("share of tasks within")
         labels = legend_of(both[0])
-        figure.legend(labels.values(), labels.keys(), loc="outside lower center", ncols=4, frameon=False)
+        figure.legend(labels.values(), labels.keys(), loc="outside lower center", ncols=3, frameon=False)
     return figure
 
 

@@ -114,8 +114,16 @@ def frame(axes: Axes3D, content: Float[np.ndarray, "points 3"], size: Float[np.n
     axes.view_init(**VIEW)
 
 
-def panels(views: Sequence[tuple[str, View]], columns: int, box: Float[np.ndarray, "8 3"], poses: int) -> Figure:
-    """Three-dimensional views at one scale, with a legend below."""
+def panels(views: Sequence[tuple[str, View]], columns: int, box: Float[np.ndarray, "8 3"], poses: int, share: float = 0.93) -> Figure:
+    """Three-dimensional views at one scale, with a legend below.
+
+    Args:
+        views: by their titles, from the upper left.
+        columns: panels in a row.
+        box: corners of the query points' bounding box, query frame, metres.
+        poses: of the trajectories.
+        share: of a row's height that its panels take; tall contents need more room between rows.
+    """
     rows = -(-len(views) // columns)
     contents = [content(view, box) for _, view in views]
     size = np.max([np.ptp(one, axis=0) for one in contents], axis=0) * 1.06
@@ -128,7 +136,7 @@ def panels(views: Sequence[tuple[str, View]], columns: int, box: Float[np.ndarra
             row, column = divmod(index, columns)
             tall = (1 - foot) / rows
             axes = figure.add_axes(
-                ((column + 0.07) / columns, foot + tall * (rows - 1 - row), 0.83 / columns, 0.93 * tall), projection="3d"
+                ((column + 0.07) / columns, foot + tall * (rows - 1 - row + (0.93 - share) / 2), 0.83 / columns, share * tall), projection="3d"
             )
             draw(axes, view, box)
             frame(axes, contents[index], size)
