@@ -44,27 +44,28 @@ def replace_file(function: str, path: str | os.PathLike, content: bytes | Callab
             temporary.unlink()
 
 
-def kept(function: str, folder: Path, about: Any, compute: Callable[[], Mapping[str, ArrayLike]]) -> dict[str, np.ndarray]:
-    """Arrays from a folder of such, or computed and put there.
+def kept(function: str, folder: Path, about: Any, compute: Callable[[], Mapping[str, ArrayLike]], build: Callable[[dict[str, np.ndarray]], Any] = dict) -> Any:
+    """What is made of arrays from a folder of such, or computed and put there.
 
     Args:
         function: who asks, for the message.
         folder: receives one .npz; it exists.
         about: all that the arrays depend on, as JSON has it; the file's name is its digest.
         compute: makes them where they are missing.
+        build: of the arrays by name, what is returned.
 
     Raises:
-        InputError: the file cannot be written, or is damaged.
+        InputError: the file cannot be written, is damaged, or holds something else.
     """
     digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
     path = folder / f"{digest[:20]}.npz"
     if not path.exists():
         arrays = dict(compute())
         replace_file(function, path, lambda file: np.savez(file, **arrays))
-        return {name: np.asarray(array) for name, array in arrays.items()}
+        return build({name: np.asarray(array) for name, array in arrays.items()})
     try:
         with path.open("rb") as opened, np.load(opened) as file:
-            return dict(file)
+            return build(dict(file))
     except Exception as error:  # damaged files raise whatever their parser stumbles on
         raise InputError(f"{function}: {path} cannot be read ({error}); delete it: it is computed again") from None
 

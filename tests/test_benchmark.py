@@ -1084,7 +1084,7 @@ def test_the_worst_failures_are_listed_by_their_turn(many, text):
     failed = sorted((one for one in ours if one.distances[0] > 0.02 or one.angles[0] > 20), key=lambda one: one.angles[0], reverse=True)
     known = sum(one.best_pick[0] <= 0.02 and one.best_pick[1] <= 20 for one in failed)
     assert len(failed) > LISTED and 0 < known < len(failed)
-    assert f"Of 60 picks of `tdf_jax`, {len(failed)} are off by more than 2 cm or 20°; in {known} of those another start was within." in text
+    assert f"Of 60 picks of `tdf_jax`, {len(failed)} are off by more than 2 cm or 20°; in {known} of those another candidate was within." in text
     rows = tables(text)[4][2:]
     assert len(rows) == LISTED
     for cells, one in zip(rows, failed):

@@ -63,11 +63,9 @@ def learnt(
         for count in counts:
             for way in COMBINATIONS if count > 1 else COMBINATIONS[:1]:
                 what = [*about, *task.identity, count, way]
-                found = kept("tdf benchmark", folder, what, lambda count=count, way=way: _pick(task, model, shown()[:count], way, seed))
+                found = kept("tdf benchmark", folder, what, lambda count=count, way=way: _pick(task, model, shown()[:count], way, seed), _errors)
                 groups.setdefault((task.case.clouds, count, way), []).append(found)
-    return [
-        Learnt(*name, [float(one["distance"]) for one in found], [float(one["angle"]) for one in found]) for name, found in groups.items()
-    ]
+    return [Learnt(*name, *map(list, zip(*found))) for name, found in groups.items()]
 
 
 def _demonstrations(task, seed, count) -> list[Demonstration]:
@@ -88,3 +86,7 @@ def _pick(task, model, shown, way, seed) -> dict:
     result = carry(encode(model, task.case.points_b), reference, key, fix_last=False)
     distance, angle = pose_error(result.trajectory.wxyz_xyz[0], task.expected.wxyz_xyz[0])
     return {"distance": distance, "angle": np.degrees(angle)}
+
+
+def _errors(arrays) -> tuple[float, float]:
+    return float(arrays["distance"]), float(arrays["angle"])

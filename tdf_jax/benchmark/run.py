@@ -51,7 +51,14 @@ def run(
                 return {} if attempt is None else vars(attempt)
 
             what = [*about, *task.identity, method]
-            found = kept("tdf benchmark", folder, what, arrays)
-            if found:
-                yield task, method, Attempt(found["trajectories"], found["scores"], float(found["seconds"]), float(found["residual"]))
+            attempt = kept("tdf benchmark", folder, what, arrays, _attempt)
+            if attempt is not None:
+                yield task, method, attempt
+
+
+def _attempt(arrays) -> Attempt | None:
+    """Of its arrays; there are none of one that cannot be tried."""
+    if not arrays:
+        return None
+    return Attempt(arrays["trajectories"], arrays["scores"], float(arrays["seconds"]), float(arrays["residual"]))
 

@@ -50,4 +50,4 @@ class Store:
         about = [self._about, what]
         # Settings are dataclasses.
         plain = json.loads(json.dumps(about, default=dataclasses.asdict))
-        return build(kept("Store", self.directory, plain, compute))
+        return kept("Store", self.directory, plain, compute, build)
