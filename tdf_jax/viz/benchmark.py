@@ -72,7 +72,7 @@ def reliability_figure(scores: Sequence[Score], bins: Sequence[Mapping]) -> Figu
         limits = np.array([one["interval"] for one in bins])
         axes.errorbar(means, rates, np.abs(limits.T - rates), color=INK, fmt="o", ms=4, lw=1, capsize=2, label="picks, 95 % interval")
         axes.set(ylabel="share within 2 cm and 20°", ylim=(-0.02, 1.04), xlim=(-0.02, 1.02))
-        axes.legend(frameon=False, loc="upper left")
+        axes.legend(frameon=False, loc="lower right")
         counts.hist([predicted[right], predicted[~right]], bins=20, range=(0, 1), color=[COLOURS(0.6), TRUTH], label=["right", "wrong"])
         counts.set(xlabel="confidence", ylabel="picks", yscale="log", ylim=(0.7, None))
         counts.yaxis.set_major_formatter("{x:g}")
