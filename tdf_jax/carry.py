@@ -77,7 +77,13 @@ def carry_trajectory(demonstrated: Trajectory, pick: Float[Array, "7"], goal: Fl
 
     Returns:
         The trajectory, T_world_query.
+
+    Raises:
+        InputError: the pick or the goal is not one pose.
     """
+    for name, pose in (("pick", pick), ("goal", goal)):
+        if pose is not None and np.shape(pose) != (7,):
+            raise InputError(f"carry_trajectory(): {name} has shape {np.shape(pose)}; expected one pose wxyz_xyz, (7,)")
     pick, goal = jnp.asarray(pick), None if goal is None else jnp.asarray(goal)
     pick_motion = poses.compose(pick, poses.inverse(demonstrated.wxyz_xyz[0]))
     if goal is None:
@@ -131,11 +137,14 @@ def carry(
         goal = jnp.asarray(goal)
     picked = Reference(reference.descriptors[:1], Trajectory(reference.trajectory.wxyz_xyz[:1]), reference.query)
     result = solve(field, picked, key, fix_last=False, energy=EnergyWeights(0.0), config=config.solver, progress=progress, mesh=mesh)
-    trajectories, starts = (_carried(reference.trajectory, part[:, 0], goal) for part in (result.trajectories, result.starts))
+    trajectories, starts = (carry_to_picks(reference.trajectory, part[:, 0], goal) for part in (result.trajectories, result.starts))
     left = residual(result.loss, picked.descriptors[0]) if result.finite.any() else float("nan")
     return dataclasses.replace(result, trajectories=trajectories, starts=starts, residual=left, confidence=confidence(left))
 
 
 @jax.jit
-def _carried(demonstrated, picks, goal):
+def carry_to_picks(
+    demonstrated: Trajectory, picks: Float[Array, "starts 7"], goal: Float[Array, "7"] | None
+) -> Float[Array, "starts poses 7"]:
+    """`carry_trajectory` from several picks."""
     return jax.vmap(lambda pick: carry_trajectory(demonstrated, pick, goal).wxyz_xyz)(picks)

@@ -82,6 +82,12 @@ def test_carrying_turns_with_the_world(shown, ends):
     np.testing.assert_allclose(moved.wxyz_xyz[:, 4:], expected[:, 4:], atol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["pick", "goal"])
+def test_several_poses_are_no_end(shown, ends, name):
+    with pytest.raises(InputError, match=rf"{name} has shape \(2, 7\); expected one pose"):
+        tdf.carry_trajectory(shown, **{"pick": ends[0], "goal": ends[1]} | {name: ends})
+
+
 def test_one_pose_becomes_the_pick(ends):
     found = tdf.carry_trajectory(tdf.Trajectory(jnp.asarray(random_poses(1, 1), jnp.float32)), ends[0], None)
     np.testing.assert_allclose(np.asarray(found.wxyz_xyz[0, 4:]), ends[0, 4:], atol=1e-6)

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 
 from tdf_jax import poses
 from tdf_jax.benchmark.task import Task, carried_by
-from tdf_jax.carry import carry, carry_trajectory
+from tdf_jax.carry import carry, carry_to_picks
 from tdf_jax.demonstration import Reference, describe
 from tdf_jax.energy import EnergyWeights
 from tdf_jax.evaluation.baselines import principal_axes, rigid_motion, settled_points
@@ -185,12 +185,8 @@ def _paper(energy: EnergyWeights) -> Callable:
     """Eq. 3 over all waypoints. Its solver takes more starts of one waypoint and finds lower energies than Adam from as many starts."""
 
     def method(task, model, encoded, key, inits):
-        return _timed(
-            encoded,
-            lambda: solve(
-                encoded.field, encoded.reference, key, goal=jnp.asarray(task.goal), energy=energy, config=SolveConfig(inits=inits, finalists=2)
-            ),
-        )
+        goal, config = jnp.asarray(task.goal), SolveConfig(inits=inits)
+        return _timed(encoded, lambda: solve(encoded.field, encoded.reference, key, goal=goal, energy=energy, config=config))
 
     return method
 
@@ -252,11 +248,6 @@ def _timed(encoded, run: Callable[[], Result]) -> Attempt:
 
 
 def _carried(task, picks, scores, seconds, *, rigidly=False) -> Attempt:
-    trajectories = np.array(_carry_all(task.demonstration.trajectory, picks, None if rigidly else task.goal))
+    trajectories = np.array(carry_to_picks(task.demonstration.trajectory, picks, None if rigidly else task.goal))
     trajectories[:, -1] = task.goal
     return Attempt(trajectories, scores, seconds)
-
-
-@jax.jit
-def _carry_all(shown, picks, goal):
-    return jax.vmap(lambda pick: carry_trajectory(shown, pick, goal).wxyz_xyz)(picks)

@@ -50,7 +50,9 @@ def _run(settings: Settings, folder: Path) -> dict:
     query_key, start_key = jax.random.split(jax.random.fold_in(jax.random.key(settings.seed), STREAM))
     with _timed(seconds, "load"):
         config = _config(settings)
-        energy = None if isinstance(config, CarryConfig) else EnergyWeights(0.02 if settings.k is None else settings.k)
+        energy = None
+        if not isinstance(config, CarryConfig):
+            energy = EnergyWeights() if settings.k is None else EnergyWeights(settings.k)
         model = load_model(settings.weights)
         scene = make_scene(settings, query_key)
     with _timed(seconds, "encode"):
