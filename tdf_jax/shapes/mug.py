@@ -5,26 +5,20 @@ Every surface is flat between neighbouring rings, so `Mug.contains` decides by t
 labels and surface samples agree to rounding (3e-5 m along a flared handle), which no smooth formula would give.
 """
 
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
-from numbers import Real
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from tdf_jax.errors import InputError
-from tdf_jax.shapes.solid import Solid, Tube, in_solid, in_tube, mitres, polygon, resample, skin, solid_rings, tube_rings
-
-if TYPE_CHECKING:
-    import trimesh
+from tdf_jax.shapes.shape import Clay, Shape, check_numbers, frame, is_one_body, moulded
+from tdf_jax.shapes.solid import Solid, Tube, bar_line, bends_freely, in_solid, inset, polygon, swept, tube_rings
 
 HANDLE_STYLES = ("d", "ring", "ear", "square")
 
 _TUBE_RINGS = 30  # rings along the handle
 _LANDMARKS_ALONG, _LANDMARKS_UP, _LANDMARKS_AROUND = 24, 16, 32  # along the handle; up the wall and around it
-_MAY_BE_ZERO = ("bulge", "edge_radius", "foot_height", "lip_radius")
-_DIMENSIONLESS = ("squareness", "handle_style", "handle_squareness", "handle_flare")
+_MAY_BE_ZERO = ("edge_radius", "foot_height", "lip_radius")
 
 
 @dataclass(frozen=True)
@@ -75,63 +69,37 @@ class MugParameters:
     handle_flare: float = 1.15
 
 
-class _Geometry(NamedTuple):
-    outer: Solid
-    hollows: tuple[Solid, ...]
-    tube: Tube
-
-
 @dataclass(frozen=True, eq=False)
-class Mug:
-    """One mug with its ground truth; every frame is T_object_frame, a 4x4 matrix in metres.
+class Mug(Shape):
+    """One mug with its ground truth; see `Shape`. Its places are the handle, the rim and the base."""
 
-    Attributes:
-        mesh: watertight, normals outward; the clay only, the cavity is open.
-        parameters: what it was built from.
-        handle_frame: origin on the handle's centre line half way between the attachments, x outward, z up.
-        rim_frame: origin on top of the rim on the side opposite to the handle, x outward (object -x), z up.
-        base_frame: origin on the axis at the plane the mug stands on, x towards the handle, z up.
-        axis: unit vector up, in the object frame.
-    """
-
-    mesh: "trimesh.Trimesh"
-    parameters: MugParameters
-    handle_frame: Float[np.ndarray, "4 4"]
-    rim_frame: Float[np.ndarray, "4 4"]
-    base_frame: Float[np.ndarray, "4 4"]
-    axis: Float[np.ndarray, "3"]
+    category = "mug"
+    unitless = ("squareness", "handle_style", "handle_squareness", "handle_flare")
 
     @property
-    def frames(self) -> dict[str, Float[np.ndarray, "4 4"]]:
-        """The frames by name: handle, rim, base."""
-        return {"handle": self.handle_frame, "rim": self.rim_frame, "base": self.base_frame}
+    def fold(self) -> int:
+        """1: the handle tells all sides apart."""
+        return 1
 
-    @cached_property
-    def _geometry(self) -> _Geometry:
-        return _geometry(self.parameters)
+    @property
+    def handle_frame(self) -> Float[np.ndarray, "4 4"]:
+        """Origin on the handle's centre line half way between the attachments, x outward, z up."""
+        return self.frames["handle"]
 
-    def contains(self, points: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:
-        """Tell which points lie in the clay, by the planes of the mesh (no ray casting).
+    @property
+    def rim_frame(self) -> Float[np.ndarray, "4 4"]:
+        """Origin on top of the rim on the side opposite to the handle, x outward (object -x), z up."""
+        return self.frames["rim"]
 
-        Args:
-            points: (points, 3), metres, object frame.
+    @property
+    def base_frame(self) -> Float[np.ndarray, "4 4"]:
+        """Origin on the axis at the plane the mug stands on, x towards the handle, z up."""
+        return self.frames["base"]
 
-        Returns:
-            (points,) True inside.
-
-        Raises:
-            InputError: the points are not (points, 3), or not finite.
-        """
-        points = np.asarray(points)
-        if points.ndim != 2 or points.shape[1] != 3:
-            raise InputError(f"Mug.contains(): points have shape {points.shape}; expected (points, 3)")
-        if not np.isfinite(points).all():
-            raise InputError("Mug.contains(): points hold NaN or infinite numbers; expected finite metres; remove them")
-        outer, hollows, tube = self._geometry
-        clay = in_solid(outer, points) | in_tube(tube, points)
-        for hollow in hollows:
-            clay &= ~in_solid(hollow, points)
-        return clay
+    @staticmethod
+    def clay_of(parameters: MugParameters) -> Clay:
+        """The body and the handle, the cavity and the recess of the foot."""
+        return _clay(parameters)
 
     def landmarks(self) -> Float[np.ndarray, "landmarks 3"]:
         """Points that correspond from mug to mug, metres, object frame: as many on every mug, in the same order.
@@ -163,46 +131,16 @@ def build_mug(parameters: MugParameters = MugParameters()) -> Mug:
     Raises:
         InputError: the dimensions do not make a mug; the message names the one to change.
     """
-    import trimesh
-
     _check(parameters)
-    outer, hollows, tube = _geometry(parameters)
-    fast = {"engine": "manifold", "check_volume": False}  # the parts are closed by construction; the result is checked
-    clay = trimesh.boolean.union([skin(solid_rings(outer)), skin(tube_rings(tube))], **fast)
-    # The cavity is cut after the handle is joined: nothing of the handle is left inside it.
-    mesh = trimesh.boolean.difference([clay, *(skin(solid_rings(hollow)) for hollow in hollows)], **fast)
-    if not (mesh.is_volume and mesh.euler_number == 0 and mesh.body_count == 1):
+    clay = _clay(parameters)
+    mesh = moulded(clay)
+    if not is_one_body(mesh, handles=1):
         raise InputError(f"build_mug(): the dimensions give no single closed cup with one handle; got {parameters}; "
                          "expected walls and handle of a common mug: move them towards the defaults")
-    grip = _grip(tube, parameters)
+    grip = _grip(clay.joined[1], parameters)
     rim = parameters.top_radius - parameters.wall_thickness / 2
     half = parameters.height / 2
-    return Mug(mesh=mesh, parameters=parameters, axis=np.array([0.0, 0.0, 1.0]),
-               handle_frame=_frame(grip[0], grip[1], 1.0), rim_frame=_frame(-rim, half, -1.0),
-               base_frame=_frame(0.0, -half, 1.0))
-
-
-def scaled(mug: Mug, factor: float) -> Mug:
-    """Scale a mug uniformly about the origin: mesh, frames and parameters.
-
-    Args:
-        mug: the mug.
-        factor: positive, no unit.
-
-    Returns:
-        A new mug.
-
-    Raises:
-        InputError: the factor is not positive and finite.
-    """
-    if not (np.isfinite(factor) and factor > 0):
-        raise InputError(f"scaled(): factor is {factor}; expected a positive number")
-    lengths = [field.name for field in fields(MugParameters) if field.name not in _DIMENSIONLESS]
-    parameters = replace(mug.parameters, **{name: getattr(mug.parameters, name) * factor for name in lengths})
-    grow = np.ones((4, 4))
-    grow[:3, 3] = factor
-    frames = {f"{name}_frame": frame * grow for name, frame in mug.frames.items()}
-    return replace(mug, mesh=mug.mesh.copy().apply_scale(factor), parameters=parameters, **frames)
+    return Mug(mesh, parameters, {"handle": frame(grip[0], grip[1]), "rim": frame(-rim, half, -1.0), "base": frame(0.0, -half)})
 
 
 def sample_mug(rng: np.random.Generator) -> MugParameters:
@@ -267,13 +205,9 @@ def _check(parameters: MugParameters) -> None:
 
     p = parameters
     need(p.handle_style in HANDLE_STYLES, f"handle_style is {p.handle_style!r}; expected one of {HANDLE_STYLES}")
-    numbers = {field.name: getattr(p, field.name) for field in fields(p) if field.name != "handle_style"}
-    for name, value in numbers.items():
-        need(isinstance(value, Real) and np.isfinite(value), f"{name} is {value!r}; expected a finite number")
-        need(value > 0 or name in _MAY_BE_ZERO, f"{name} is {value}; expected a positive number")
-        need(value >= 0 or name == "bulge", f"{name} is {value}; expected zero or a positive number")
+    check_numbers("build_mug", p, may_be_zero=_MAY_BE_ZERO, may_be_negative=("bulge",))
     for name in ("squareness", "handle_squareness"):
-        need(2 <= numbers[name] <= 20, f"{name} is {numbers[name]}; expected 2 (round) to 20 (square)")
+        need(2 <= getattr(p, name) <= 20, f"{name} is {getattr(p, name)}; expected 2 (round) to 20 (square)")
     need(1 <= p.handle_flare <= 2, f"handle_flare is {p.handle_flare}; expected 1 to 2")
     need(2 * p.lip_radius < p.wall_thickness, "lip_radius must be less than half of wall_thickness")
     floor = p.foot_height + p.bottom_thickness
@@ -294,14 +228,12 @@ def _check(parameters: MugParameters) -> None:
 
 
 def _check_handle(p: MugParameters, need) -> None:
-    outer, _, tube = _geometry(p)
+    outer, tube = _clay(p).joined
     rings = tube_rings(tube)
     need(rings[..., 2].min() > -p.height / 2, "the handle hangs below the bottom: raise handle_bottom")
     buried = in_solid(outer, np.concatenate([rings[0], rings[-1]])).all()
     need(buried, "the handle does not end inside the body: move its attachments away from the rounded edge")
-    steps = np.diff(rings[..., [0, 2]], axis=0)
-    forward = np.einsum("smi,si->sm", steps, np.diff(tube.line, axis=0))
-    need((forward > 0).all(), "the handle bends more tightly than its thickness allows: thin it or move it out")
+    need(bends_freely(tube), "the handle bends more tightly than its thickness allows: thin it or move it out")
     gap = tube.line[:, 0] - p.handle_thickness * tube.scales / 2 - _wall(p, tube.line[:, 1] + p.height / 2)
     free = gap > 0.02 * p.height
     need(np.abs(np.diff(free.astype(int))).sum() == 2, "the handle leaves no finger hole: raise handle_reach")
@@ -318,11 +250,6 @@ def _inner_edge(p: MugParameters) -> float:
     return max(p.edge_radius - p.wall_thickness, p.wall_thickness / 2)
 
 
-def _inset(distance, radius: float):
-    """How far a quarter circle of this radius draws back at a distance from the end it rounds."""
-    return radius - np.sqrt(np.maximum(radius**2 - np.maximum(radius - distance, 0) ** 2, 0))
-
-
 def _levels(p: MugParameters, low: float, high: float, low_radius: float, high_radius: float) -> np.ndarray:
     """Levels for the rings of a profile: close together along both roundings."""
     quarter = 1 - np.cos(np.linspace(0, np.pi / 2, 6))
@@ -331,32 +258,25 @@ def _levels(p: MugParameters, low: float, high: float, low_radius: float, high_r
     return np.unique(np.round(levels / p.height, 9)) * p.height  # one level where parts meet
 
 
-def _geometry(p: MugParameters) -> _Geometry:
+def _clay(p: MugParameters) -> Clay:
     floor = p.foot_height + p.bottom_thickness
     levels = _levels(p, 0.0, p.height, p.edge_radius, p.lip_radius)
-    radii = _wall(p, levels) - _inset(levels, p.edge_radius) - _inset(p.height - levels, p.lip_radius)
+    radii = _wall(p, levels) - inset(levels, p.edge_radius) - inset(p.height - levels, p.lip_radius)
     outer = Solid(levels - p.height / 2, radii, p.squareness)
     levels = _levels(p, floor, p.height, _inner_edge(p), p.lip_radius)
     radii = _wall(p, levels) - p.wall_thickness
-    radii = radii - _inset(levels - floor, _inner_edge(p)) + _inset(p.height - levels, p.lip_radius)
+    radii = radii - inset(levels - floor, _inner_edge(p)) + inset(p.height - levels, p.lip_radius)
     above = np.append(levels, 1.5 * p.height)  # cut well past the rim, so no two faces coincide
     cavity = Solid(above - p.height / 2, np.append(radii, radii[-1]), p.squareness)
     if p.foot_height == 0:
-        return _Geometry(outer, (cavity,), _tube(p))
+        return Clay((outer, _tube(p)), (cavity,))
     inner = p.bottom_radius - p.edge_radius - p.foot_width
     recess = Solid(np.array([-p.height, p.foot_height - p.height / 2]), np.array([inner, inner]), p.squareness)
-    return _Geometry(outer, (cavity, recess), _tube(p))
+    return Clay((outer, _tube(p)), (cavity, recess))
 
 
 def _tube(p: MugParameters) -> Tube:
-    line = resample(_centre_line(p), _TUBE_RINGS)
-    share = np.linspace(-1, 1, len(line))
-    scales = 1 + (p.handle_flare - 1) * share**4
-    ends = np.stack([[0.4 * end[0], end[1]] for end in (line[0], line[-1])])  # buried: level, well inside the body
-    line = np.concatenate([ends[:1], line, ends[1:]])
-    scales = np.concatenate([scales[:1], scales, scales[-1:]])
-    section = np.array([p.handle_thickness, p.handle_width]) / 2
-    return Tube(line, mitres(line), scales, section, p.handle_squareness)
+    return swept(_centre_line(p), p.handle_thickness, p.handle_width, p.handle_squareness, p.handle_flare, _TUBE_RINGS)
 
 
 def _centre_line(p: MugParameters) -> np.ndarray:
@@ -367,10 +287,7 @@ def _centre_line(p: MugParameters) -> np.ndarray:
     half, middle = (top - bottom) / 2, (top + bottom) / 2 - p.height / 2
     if p.handle_style in ("d", "square"):
         radius = {"d": 0.98, "square": 0.5}[p.handle_style] * min(half, p.handle_reach)
-        turn = np.linspace(0, np.pi / 2, 40)
-        x, z = x_bar - radius * (1 - np.sin(turn)), middle + half - radius * (1 - np.cos(turn))
-        arms = np.array([[x_top, middle + half]]), np.array([[x_bottom, middle - half]])
-        return np.concatenate([arms[0], np.stack([x, z], 1), np.stack([x, 2 * middle - z], 1)[::-1], arms[1]])
+        return bar_line(x_top, x_bottom, x_bar, middle + half, middle - half, radius)
     t = np.linspace(0, 1, 160)
     if p.handle_style == "ring":
         centre = 0.35  # of the reach; the ellipse crosses the wall past its widest height
@@ -399,10 +316,3 @@ def _grip(tube: Tube, p: MugParameters) -> np.ndarray:
     a, b = a[crossing], b[crossing]
     share = (height - a[:, 1]) / (b[:, 1] - a[:, 1])
     return np.array([np.max(a[:, 0] + share * (b[:, 0] - a[:, 0])), height])
-
-
-def _frame(x: float, z: float, outward: float) -> np.ndarray:
-    """T_object_frame at (x, 0, z), z up, its x axis along object x times `outward` (1 or -1)."""
-    frame = np.diag([outward, outward, 1.0, 1.0])
-    frame[:3, 3] = x, 0.0, z
-    return frame

@@ -1,4 +1,4 @@
-"""Solids made of stacked polygons, turned about an axis or swept along a line: their meshes and exact inside tests."""
+"""Solids made of stacked polygons, about an axis or swept along a line: their meshes and exact inside tests."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -19,6 +19,13 @@ class Solid(NamedTuple):
     squareness: float
 
 
+class Loft(NamedTuple):
+    """Polygons about the z axis, corners at even angles and at `radii` (rings, corners) from it, straight between `heights` (rings,)."""
+
+    heights: np.ndarray
+    radii: np.ndarray
+
+
 class Tube(NamedTuple):
     """A section swept along `line` (rings, 2) in the x-z plane, cut at each ring along its mitre (rings, 2).
 
@@ -30,6 +37,25 @@ class Tube(NamedTuple):
     scales: np.ndarray
     section: np.ndarray
     squareness: float
+
+
+Part = Solid | Loft | Tube
+
+
+def encloses(part: Part, points: np.ndarray) -> np.ndarray:
+    """Which points (points, 3) lie in a part."""
+    return {Solid: in_solid, Loft: in_loft, Tube: in_tube}[type(part)](part, points)
+
+
+def rings(part: Part) -> np.ndarray:
+    """The corners (rings, corners, 3) of a part."""
+    return {Solid: solid_rings, Loft: loft_rings, Tube: tube_rings}[type(part)](part)
+
+
+def section(aspect: float, exponent: float) -> np.ndarray:
+    """Radii (corners,) at even angles of a superellipse that reaches 1 along x and `aspect` along y."""
+    angle = np.arange(_AROUND) * (2 * np.pi / _AROUND)
+    return (np.abs(np.cos(angle)) ** exponent + np.abs(np.sin(angle) / aspect) ** exponent) ** (-1 / exponent)
 
 
 def polygon(exponent: float, count: int) -> np.ndarray:
@@ -58,6 +84,35 @@ def solid_rings(solid: Solid) -> np.ndarray:
     rings = solid.radii[:, None, None] * polygon(solid.squareness, _AROUND)
     heights = np.broadcast_to(solid.heights[:, None, None], (*rings.shape[:2], 1))
     return np.concatenate([rings, heights], axis=-1)
+
+
+def in_loft(loft: Loft, points: np.ndarray) -> np.ndarray:
+    """Which points (points, 3) lie in a loft: within the polygon it has at their height.
+
+    A mesh splits what lies between two rings into triangles; where the rings have different shapes these differ from the straight surface by
+    less than 1e-4 m on the rings of a bottle's shoulder.
+    """
+    heights, radii = loft
+    height = points[:, 2]
+    below = np.clip(np.searchsorted(heights, height, side="right") - 1, 0, len(heights) - 2)
+    share = (height - heights[below]) / (heights[below + 1] - heights[below])
+    corner = np.arctan2(points[:, 1], points[:, 0]) * (radii.shape[1] / (2 * np.pi))
+    first = np.floor(corner).astype(int) % radii.shape[1]
+    ends = []
+    for one in (first, (first + 1) % radii.shape[1]):
+        angle = one * (2 * np.pi / radii.shape[1])
+        radius = (1 - share) * radii[below, one] + share * radii[below + 1, one]
+        ends.append(radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    along, to_point = ends[1] - ends[0], points[:, :2] - ends[0]
+    left = along[:, 0] * to_point[:, 1] - along[:, 1] * to_point[:, 0] >= 0
+    return left & (height >= heights[0]) & (height <= heights[-1])
+
+
+def loft_rings(loft: Loft) -> np.ndarray:
+    """The corners (rings, corners, 3) of a loft, upwards."""
+    angle = np.arange(loft.radii.shape[1]) * (2 * np.pi / loft.radii.shape[1])
+    heights = np.broadcast_to(loft.heights[:, None], loft.radii.shape)
+    return np.stack([loft.radii * np.cos(angle), loft.radii * np.sin(angle), heights], axis=-1)
 
 
 def in_tube(tube: Tube, points: np.ndarray) -> np.ndarray:
@@ -100,6 +155,34 @@ def _directions(line: np.ndarray) -> np.ndarray:
 def _normal(vectors: np.ndarray) -> np.ndarray:
     """Vectors (..., 2) of the x-z plane turned by 90 degrees, so that (turned, y, vector) is right-handed."""
     return np.stack([vectors[..., 1], -vectors[..., 0]], axis=-1)
+
+
+def inset(distance, radius: float):
+    """How far a quarter circle of this radius draws back at a distance from the end it rounds."""
+    return radius - np.sqrt(np.maximum(radius**2 - np.maximum(radius - distance, 0) ** 2, 0))
+
+
+def bar_line(x_top: float, x_bottom: float, x_bar: float, top: float, bottom: float, radius: float) -> np.ndarray:
+    """A handle's centre line (points, 2) in the x-z plane: a level arm out to an upright bar, round corners, and an arm back."""
+    turn, middle = np.linspace(0, np.pi / 2, 40), (top + bottom) / 2
+    x, z = x_bar - radius * (1 - np.sin(turn)), top - radius * (1 - np.cos(turn))
+    return np.concatenate([[[x_top, top]], np.stack([x, z], 1), np.stack([x, 2 * middle - z], 1)[::-1], [[x_bottom, bottom]]])
+
+
+def swept(line: np.ndarray, thickness: float, width: float, squareness: float, flare: float, count: int) -> Tube:
+    """A handle's tube along its centre line, `flare` times as thick at both ends, which it enters level, towards the axis."""
+    line = resample(line, count)
+    scales = 1 + (flare - 1) * np.linspace(-1, 1, len(line)) ** 4
+    ends = np.stack([[0.4 * end[0], end[1]] for end in (line[0], line[-1])])  # buried, well inside the body
+    line = np.concatenate([ends[:1], line, ends[1:]])
+    scales = np.concatenate([scales[:1], scales, scales[-1:]])
+    return Tube(line, mitres(line), scales, np.array([thickness, width]) / 2, squareness)
+
+
+def bends_freely(tube: Tube) -> bool:
+    """Whether no ring of a tube cuts into the next."""
+    steps = np.diff(tube_rings(tube)[..., [0, 2]], axis=0)
+    return bool((np.einsum("smi,si->sm", steps, np.diff(tube.line, axis=0)) > 0).all())
 
 
 def resample(line: np.ndarray, count: int) -> np.ndarray:
