@@ -15,7 +15,7 @@ def dataset(
     workers: Annotated[int, tyro.conf.arg(help_behavior_hint="(default: one for every core)")] = 0,
     recipe: Annotated[Recipe, tyro.conf.arg(name="")] = Recipe(),
 ) -> None:
-    """Label generated mugs, or your own meshes, for `tdf train`; or go on where an interrupted call stood.
+    """Label generated objects, or your own meshes, for `tdf train`; or go on where an interrupted call stood.
 
     Args:
         out: folder of the data set.

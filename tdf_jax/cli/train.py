@@ -11,7 +11,7 @@ from tdf_jax.checkpoint import SUFFIX, load_model, save_model
 from tdf_jax.errors import InputError
 from tdf_jax.model import Model, ModelInfo
 from tdf_jax.training.config import TrainConfig
-from tdf_jax.training.dataset import Recipe, build, load
+from tdf_jax.training.dataset import Recipe, build, joined, load
 from tdf_jax.training.loop import steps_within, train as run
 from tdf_jax.training.record import metrics, settings_of
 
@@ -19,8 +19,8 @@ from tdf_jax.training.record import metrics, settings_of
 def train(
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")],
     data: Annotated[
-        Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="(default: generated mugs, in OUT/data)")
-    ] = None,
+        tuple[Path, ...], tyro.conf.arg(metavar="DIR [DIR ...]", help_behavior_hint="(default: generated mugs, in OUT/data)")
+    ] = (),
     start_from: Annotated[
         str | None, tyro.conf.arg(metavar="WEIGHTS", help_behavior_hint="(default: random weights)")
     ] = None,
@@ -34,7 +34,7 @@ def train(
 
     Args:
         out: folder of the run: its settings, metrics, curves and checkpoint.
-        data: folder made by tdf dataset.
+        data: folder made by tdf dataset; several for one network of several categories.
         start_from: a name of shipped weights or a .safetensors file to go on from; --learning-rate 0.003 suits it.
         minutes: choose --steps so that the run takes about so long on this machine.
         weights: .safetensors file to write at the end.
@@ -49,10 +49,10 @@ def train(
     model = None if start_from is None else load_model(start_from)
     if model is not None and model.config != config.network:
         raise InputError(f"tdf train: --start-from {start_from} is a network of other sizes ({model.config}); expected {config.network}")
-    if data is None:
-        data = out / "data"
-        build(Recipe(seed=config.seed), data, os.cpu_count() or 1)
-    objects, validation = load(data)
+    if not data:
+        data = (out / "data",)
+        build(Recipe(seed=config.seed), data[0], os.cpu_count() or 1)
+    objects, validation = (joined(sets) for sets in zip(*(load(folder) for folder in data)))
     before = settings_of(out)
     if minutes is not None:
         # A run that stands keeps its steps: they are what its learning rate follows.

@@ -39,12 +39,16 @@ class AnnotatedMesh:
         mesh: metres.
         height: of the body, metres.
         frames: T_object_place, 4x4, by name.
+        category: what it is.
+        fold: its symmetry about z, see `tdf_jax.symmetry`.
     """
 
     name: str
     mesh: "trimesh.Trimesh"
     height: float
     frames: dict[str, Float[np.ndarray, "4 4"]]
+    category: str = "mug"
+    fold: int = 1
 
     def contains(self, points: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"] | None:
         """Which points, (points, 3), metres, canonical frame, lie in the clay; None for an open surface."""

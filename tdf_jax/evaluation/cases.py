@@ -27,7 +27,9 @@ class Transfer:
         points_a: cloud of the demonstration's object, which lies in its canonical frame, (points, 3), metres.
         points_b: cloud of the new object, in a random pose.
         T_world_place_a: the semantic place on object a, 4x4.
-        T_world_place_b: the same place on object b: the truth.
+        T_world_place_b: the same place on object b: the truth, or one of several that object b's symmetry makes equal.
+        T_world_b: pose of object b's canonical frame, 4x4.
+        fold: object b's symmetry about the z axis of that frame, see `tdf_jax.symmetry`.
         scale: of both objects, and so of the query, over a common mug's size.
     """
 
@@ -35,6 +37,8 @@ class Transfer:
     points_b: Float[np.ndarray, "seen 3"]
     T_world_place_a: Float[np.ndarray, "4 4"]
     T_world_place_b: Float[np.ndarray, "4 4"]
+    T_world_b: Float[np.ndarray, "4 4"]
+    fold: int
     scale: float
 
 
@@ -44,14 +48,12 @@ class Case(Transfer):
 
     Attributes:
         object_a, object_b: the objects, in their canonical frames.
-        T_world_b: pose of object b's canonical frame, 4x4.
         instance: name of object b; cases of one object in several poses share it.
         clouds: the condition of `points_b`, one of `tdf_jax.evaluation.clouds.CONDITIONS`.
     """
 
     object_a: Mug
     object_b: Mug | AnnotatedMesh
-    T_world_b: Float[np.ndarray, "4 4"]
     instance: str
     clouds: str
 
@@ -136,6 +138,7 @@ def _case(a: Mug, b: Mug | AnnotatedMesh, seed: int, number: int, points: int, p
         object_a=a,
         object_b=b,
         T_world_b=T_world_b,
+        fold=b.fold,
         instance=instance,
         clouds=clouds,
         scale=SCALES.get(clouds, 1.0),

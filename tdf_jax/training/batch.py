@@ -9,6 +9,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from tdf_jax.pointcloud import thin
+from tdf_jax.symmetry import about_z, nearest_turn
 from tdf_jax.training.dataset import DataSet
 from tdf_jax.training.objects import BOX_PADDING
 
@@ -36,6 +37,7 @@ GLOBAL_SHARE = 0.4  # of the wrong poses: any rotation, any position about the o
 GLOBAL_SPREAD = 0.35  # standard deviation of the position, of the diagonal
 NEAR_ANGLES = (3.0, 90.0)  # degrees, log-uniform
 NEAR_DISTANCES = (0.01, 0.3)  # of the pair's diagonal, log-uniform
+LEAST_WRONG = 0.01  # of the pair's diagonal: root mean square distance of query points from where a symmetric object's right poses have them
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +48,7 @@ class Batch:
         clouds: one of each object.
         queries, inside: labelled points, relative to the cloud's mean.
         centres: origins of the objects' frames, relative to the cloud's mean.
+        sided: 1 where the object has a front, the x axis of its frame; 0 where its symmetry leaves none.
         shown: query points at a place of each object, relative to its mean.
         offered: the same query points on the pair's other object, relative to that one's mean: first where the place has
             them there, then at wrong poses.
@@ -55,6 +58,7 @@ class Batch:
     queries: Float[np.ndarray, "pairs 2 queries 3"]
     inside: Float[np.ndarray, "pairs 2 queries"]
     centres: Float[np.ndarray, "pairs 2 3"]
+    sided: Float[np.ndarray, "pairs 2"]
     shown: Float[np.ndarray, "pairs 2 box 3"]
     offered: Float[np.ndarray, "pairs 2 poses box 3"]
 
@@ -79,8 +83,12 @@ def draw(
     for _ in range(pairs):
         diagonal = _log_uniform(rng, USUAL_DIAGONALS if rng.uniform() < 0.5 else DIAGONALS)
         samples = []
-        for _ in range(2):
-            index = rng.integers(len(data.surface))
+        for which in range(2):
+            if which == 0:  # all sources alike, however many objects they have
+                among = data.sources[rng.integers(len(data.sources)) if len(data.sources) > 1 else 0]
+            else:  # a partner of the same kind: places mean the same on both, and what leaves one as it is leaves the other
+                among = data.kinds[data.kind[index]]
+            index = among[rng.integers(len(among))]
             cloud = thin(_sensed(data, rng, index, corruption, points), points)
             chosen = rng.integers(data.queries.shape[1], size=queries)
             size = diagonal * math.exp(rng.uniform(-PAIR_SPREAD, PAIR_SPREAD))
@@ -111,15 +119,15 @@ def _sensed(data, rng, index, corruption, points):
 
 
 def validation_pairs(data: DataSet, points: int, box: int, poses: int, one_view: bool) -> list[Batch]:
-    """All objects in pairs, for measuring: a diagonal of `VALIDATION_DIAGONAL`, all uniform queries.
+    """Objects in pairs of a kind, for measuring: a diagonal of `VALIDATION_DIAGONAL`, all uniform queries.
 
     Args:
-        data: an even number of objects.
+        data: the objects.
         points, box, poses: as in `draw`.
         one_view: clouds of what the first camera sees, not complete ones.
     """
     samples = []
-    for index in range(len(data.surface)):
+    for index in data.pairs().ravel():
         surface, queries = data.surface[index], np.arange(data.queries.shape[1])[data.uniform]
         surface = surface[data.visible[index, 0]] if one_view else surface
         samples.append(_sample(data, index, thin(surface, points), queries, VALIDATION_DIAGONAL))
@@ -135,7 +143,9 @@ class _Sample(NamedTuple):
     queries: np.ndarray
     inside: np.ndarray
     centre: np.ndarray
+    sided: bool
     places: np.ndarray
+    fold: int
 
 
 def _sample(data, index, cloud, chosen, size):
@@ -143,11 +153,12 @@ def _sample(data, index, cloud, chosen, size):
     places = data.places[index].copy()
     places[:, :3, 3] = (places[:, :3, 3] - origin) * size
     queries, inside = (data.queries[index, chosen] - origin) * size, data.inside[index, chosen]
-    return _Sample((cloud - origin) * size, queries, inside, -origin * size, places)
+    fold = int(data.fold[index])
+    return _Sample((cloud - origin) * size, queries, inside, -origin * size, fold == 1, places, fold)
 
 
 def _pair(rng, samples, diagonal, box, poses):
-    """The fields of `Batch`: two samples, and query points shown at a place of each and offered to the other."""
+    """The fields of `Batch`: two samples of a kind, and query points shown at a place of each and offered to the other."""
     shown, offered = [], []
     for a, b in (samples, samples[::-1]):
         place = 0 if rng.uniform() < FIRST_SHARE else rng.integers(1, len(a.places))
@@ -158,9 +169,22 @@ def _pair(rng, samples, diagonal, box, poses):
             T_place_query[:3, 3] = _direction(rng) * _log_uniform(rng, REMOTE_DISTANCES) * diagonal
         shown.append(_apply(a.places[place] @ T_place_query, x))
         right = b.places[place] @ T_place_query
-        offered.append([_apply(T, x) for T in (right, *(_wrong(rng, right, diagonal) for _ in range(poses - 1)))])
-    fields = (np.stack([getattr(sample, name) for sample in samples]) for name in ("cloud", "queries", "inside", "centre"))
+        wrong = [_unlike(rng, right, diagonal, x, b) for _ in range(poses - 1)]
+        offered.append([_apply(T, x) for T in (right, *wrong)])
+    fields = (np.stack([getattr(sample, name) for sample in samples]) for name in ("cloud", "queries", "inside", "centre", "sided"))
     return *fields, shown, offered
+
+
+def _unlike(rng, right, diagonal, x, target):
+    """A pose that no symmetry of the target makes a right one: turned about its axis, a round bowl looks the same."""
+    while True:
+        wrong = _wrong(rng, right, diagonal)
+        if target.fold == 1:
+            return wrong
+        there, here = (_apply(T, x) - target.centre for T in (wrong, right))
+        nearest = here @ about_z(nearest_turn(there, here, target.fold))[:3, :3].T
+        if np.sqrt(np.mean(np.sum((there - nearest) ** 2, axis=1))) > LEAST_WRONG * diagonal:
+            return wrong
 
 
 def _wrong(rng, right, diagonal):

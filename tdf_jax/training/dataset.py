@@ -7,16 +7,20 @@ import hashlib
 import json
 import multiprocessing
 import signal
+from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from tqdm import tqdm
 
 from tdf_jax.errors import InputError
 from tdf_jax.files import replace_file
 from tdf_jax.meshes import MESH_SUFFIXES, file_axes, libigl
-from tdf_jax.training.objects import UNIFORM_SHARE, Labelled, canonical_mesh, generated_mug, scanned_object
+from tdf_jax.shapes import FAMILIES
+from tdf_jax.symmetry import FOLDS
+from tdf_jax.training.objects import UNIFORM_SHARE, Labelled, canonical_mesh, generated_object, scanned_object
 
 MANIFEST = "dataset.json"
 SHARD = 50  # objects in a file, 9 MB: what a kill can lose
@@ -29,7 +33,7 @@ UNIT_SPREAD = 20.0  # largest diagonal over the smallest in a folder; more means
 
 @dataclasses.dataclass(frozen=True)
 class Recipe:
-    """What a data set is made of; by default the shipped mug network's generated mugs.
+    """What a data set is made of; by default the generated mugs of the shipped mug network.
 
     Attributes:
         seed: of every draw; disjoint seeds give disjoint generated objects.
@@ -38,10 +42,12 @@ class Recipe:
         points: surface points of an object.
         queries: labelled query points of an object, half uniform in the padded bounding box, half near the surface.
         cameras: around an object, from which partial clouds are seen.
-        meshes: folder of aligned meshes of one category; generated mugs if it is not given.
+        category: family of generated objects: mug, bowl or bottle.
+        meshes: folder of aligned meshes of one category, in place of generated objects.
         unit: metres per unit of the mesh files.
         up: their axis that points up.
-        front: their axis towards what tells the object's side, such as a mug's handle.
+        front: their axis towards what tells the object's side, such as a mug's handle, or along their longer side.
+        fold: their symmetry about the axis that points up: 1 none, 2 half turns, 4 quarters, 0 any turn leaves them as they are.
         stretch: repeated meshes are scaled along every axis by up to e to this, at random.
     """
 
@@ -51,10 +57,12 @@ class Recipe:
     points: int = 3000
     queries: int = 12000
     cameras: int = 16
+    category: str = "mug"
     meshes: str | None = None
     unit: float = 1.0
     up: str = "+z"
     front: str = "+x"
+    fold: int = 1
     stretch: float = 0.15
 
     def __post_init__(self):
@@ -62,6 +70,12 @@ class Recipe:
         for name, low in least.items():
             if getattr(self, name) < low:
                 raise InputError(f"Recipe(): {name} is {getattr(self, name)}; expected at least {low}")
+        if self.category not in FAMILIES:
+            raise InputError(f"Recipe(): category is {self.category!r}; expected one of {', '.join(FAMILIES)}")
+        if self.fold not in FOLDS:
+            raise InputError(f"Recipe(): fold is {self.fold}; expected one of {', '.join(map(str, FOLDS))}")
+        if self.meshes is None and self.fold != 1:
+            raise InputError("Recipe(): fold is for meshes; generated objects know theirs; drop it")
         if self.validation % 2:
             raise InputError(f"Recipe(): validation is {self.validation}; expected an even number, objects come in pairs")
         if not 0 < self.unit < np.inf:
@@ -73,7 +87,10 @@ class Recipe:
 
 @dataclasses.dataclass(frozen=True)
 class DataSet:
-    """Objects in their canonical frame (up +z, front or handle +x), scaled to unit diagonal; fields as in `Labelled`."""
+    """Objects in their canonical frame (up +z, front, handle or long side +x), scaled to unit diagonal; fields as in `Labelled`.
+
+    `source` tells which of several data sets an object is from.
+    """
 
     surface: Float[np.ndarray, "objects points 3"]
     queries: Float[np.ndarray, "objects queries 3"]
@@ -81,11 +98,36 @@ class DataSet:
     visible: Bool[np.ndarray, "objects cameras points"]
     places: Float[np.ndarray, "objects places 4 4"]
     diagonal: Float[np.ndarray, " objects"]
+    fold: Int[np.ndarray, " objects"]
+    source: Int[np.ndarray, " objects"]
 
     @property
     def uniform(self) -> slice:
         """The queries that are uniform in the padded box."""
         return slice(0, int(self.queries.shape[1] * UNIFORM_SHARE))
+
+    @cached_property
+    def sources(self) -> list[Int[np.ndarray, " members"]]:
+        """Indices of the objects of each source."""
+        return [np.flatnonzero(self.source == source) for source in np.unique(self.source)]
+
+    @cached_property
+    def kinds(self) -> list[Int[np.ndarray, " members"]]:
+        """Indices of the objects of each kind, one source and symmetry: places mean the same on all of them."""
+        kinds = np.stack([self.source, self.fold], axis=1)
+        return [np.flatnonzero((kinds == kind).all(axis=1)) for kind in np.unique(kinds, axis=0)]
+
+    @cached_property
+    def kind(self) -> Int[np.ndarray, " objects"]:
+        """Of every object, the number of its kind in `kinds`."""
+        kind = np.empty(len(self.fold), int)
+        for number, members in enumerate(self.kinds):
+            kind[members] = number
+        return kind
+
+    def pairs(self) -> Int[np.ndarray, "pairs 2"]:
+        """Every object with another of its kind; of an odd number the last is left out."""
+        return np.concatenate([members[: len(members) // 2 * 2].reshape(-1, 2) for members in self.kinds])
 
     def digest(self) -> str:
         """A name for the contents, by which a resumed run knows its data again."""
@@ -143,7 +185,32 @@ def load(directory: str | Path) -> tuple[DataSet, DataSet]:
         if not (directory / name).exists():
             raise InputError(f"load(): {directory} has no {name}; the data set is not finished: run its tdf dataset command again")
         parts[split].append(_read(directory / name, lambda file, count=len(indices): _unpacked(file, recipe, count)))
-    return tuple(DataSet(*(np.concatenate(column) for column in zip(*parts[split]))) for split in SPLITS)
+    return tuple(_collected(parts[split]) for split in SPLITS)
+
+
+def joined(sets: Sequence[DataSet]) -> DataSet:
+    """Several data sets as one, for a network of several categories; `source` numbers them.
+
+    Args:
+        sets: from `load`, with as many points, queries, cameras and places an object.
+
+    Raises:
+        InputError: they differ in these.
+    """
+    shapes = [{name: getattr(one, name).shape[1:] for name in Labelled._fields} for one in sets]
+    different = [name for name in shapes[0] if any(shape[name] != shapes[0][name] for shape in shapes)]
+    if different:
+        raise InputError(
+            f"joined(): the data sets differ in {', '.join(different)}; expected as many points, queries, cameras and places an object in each: "
+            "build them with the same options"
+        )
+    columns = {name: np.concatenate([getattr(one, name) for one in sets]) for name in Labelled._fields}
+    return DataSet(**columns, source=np.repeat(np.arange(len(sets)), [len(one.fold) for one in sets]))
+
+
+def _collected(parts) -> DataSet:
+    columns = [np.concatenate(column) for column in zip(*parts)]
+    return DataSet(*columns, source=np.zeros(len(columns[0]), int))
 
 
 def _shards(recipe):
@@ -158,6 +225,7 @@ def _unpacked(file, recipe, count):
         arrays = dict(arrays)
     for field, size in zip(BITS, (recipe.queries, recipe.points), strict=True):
         arrays[field] = np.unpackbits(arrays[field], axis=-1, count=size).astype(bool)
+    arrays.setdefault("fold", np.ones(count, np.int8))  # data sets made before there were symmetric objects
     labelled = Labelled(**arrays)
     if any(len(array) != count for array in labelled):
         raise ValueError(f"expected {count} objects")
@@ -181,7 +249,9 @@ def _claimed(directory, manifest):
     if not (directory / MANIFEST).exists():
         return False
     old = _read(directory / MANIFEST, lambda file: dict(json.load(file)))
-    changed = [name for name in manifest["recipe"] if old.get("recipe", {}).get(name) != manifest["recipe"][name]]
+    defaults = dataclasses.asdict(Recipe())
+    before = defaults | old.get("recipe", {})
+    changed = [name for name in manifest["recipe"] if before[name] != manifest["recipe"][name]]
     changed += ["files"] * (old.get("files") != manifest["files"])
     if changed:
         raise InputError(
@@ -235,9 +305,9 @@ def _label(task) -> Labelled:
     rng = np.random.default_rng([recipe.seed + (VALIDATION_SEED if split == "validation" else 0), index])
     counts = recipe.points, recipe.queries, recipe.cameras
     if not files:
-        return generated_mug(rng, *counts)
+        return generated_object(recipe.category, rng, *counts)
     mesh = canonical_mesh(files[index % len(files)], recipe.unit, recipe.up, recipe.front)
-    return scanned_object(mesh, rng, *counts, stretch=recipe.stretch if index >= len(files) else 0.0)
+    return scanned_object(mesh, rng, *counts, stretch=recipe.stretch if index >= len(files) else 0.0, fold=recipe.fold)
 
 
 @contextlib.contextmanager

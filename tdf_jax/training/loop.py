@@ -132,15 +132,16 @@ def steps_within(minutes: float, config: TrainConfig, data: DataSet) -> int:
 
 
 def _transfers(validation: DataSet) -> list[Transfer]:
-    """The first place of one validation object, to be found on the next, turned and moved; at most `TRANSFERS`."""
+    """The first place of one validation object, to be found on another of its kind, turned and moved; at most `TRANSFERS`."""
     transfers = []
-    for index in range(min(TRANSFERS, len(validation.surface) // 2)):
+    pairs = validation.pairs()
+    for index, pair in enumerate(pairs[:: max(1, len(pairs) // TRANSFERS)][:TRANSFERS]):
         T_world_b = random_pose(0, index)
         (points_a, place_a), (points_b, place_b) = (
-            (VALIDATION_DIAGONAL * validation.surface[one], _at_size(validation.places[one, 0])) for one in (2 * index, 2 * index + 1)
+            (VALIDATION_DIAGONAL * validation.surface[one], _at_size(validation.places[one, 0])) for one in pair
         )
         moved = (points_b @ T_world_b[:3, :3].T + T_world_b[:3, 3]).astype(np.float32)
-        transfers.append(Transfer(points_a, moved, place_a, T_world_b @ place_b, scale=1.0))
+        transfers.append(Transfer(points_a, moved, place_a, T_world_b @ place_b, T_world_b, int(validation.fold[pair[1]]), scale=1.0))
     return transfers
 
 
@@ -233,13 +234,20 @@ def _start(config, data, optimiser, initial):
         frame = jnp.zeros((config.network.latent, 3))
     else:
         network = jax.tree.map(jnp.array, initial)  # a copy: the first step takes its arguments over
-        frame = _read_outs(np.asarray(latents(network)), centres)
+        frame = _read_outs(np.asarray(latents(network)), centres, samples.sided.reshape(8))
     params = {"network": network, "frame": frame}
     return params, {"optimiser": optimiser.init(params), "average": jax.tree.map(jnp.copy, params)}
 
 
-def _read_outs(latents, centres):
+def _read_outs(latents, centres, sided):
     """The frame's read-outs (latent, 3) that fit latents (objects, latent, 3) best; weights do not carry them."""
-    truths = np.concatenate([np.stack([*FRAME_AXES, centre], axis=1) for centre in centres])
-    features = np.concatenate([latent.T for latent in latents])
-    return jnp.asarray(np.linalg.lstsq(features, truths)[0], jnp.float32)
+    truths = np.stack([np.stack([*FRAME_AXES, centre], axis=1) for centre in centres])
+    read = [_fitted(latents[known], truths[known][..., number]) for number, known in enumerate((sided >= 0, sided > 0, sided >= 0))]
+    return jnp.asarray(np.stack(read, axis=1), jnp.float32)
+
+
+def _fitted(latents, truths):
+    """The read-out (latent,) of least squares; zeros where there is nothing to fit it to."""
+    if not len(latents):
+        return np.zeros(latents.shape[1])
+    return np.linalg.lstsq(np.concatenate([latent.T for latent in latents]), truths.reshape(-1))[0]

@@ -10,7 +10,7 @@ from tdf_jax.network import NetworkConfig, condition, decode, encode_latent
 
 FRAME_WEIGHT = 0.3
 PLACE_WEIGHT = 0.1
-# Generated mugs come in a canonical frame: up, and the handle's side.
+# Objects come in a canonical frame: up, and the side of the handle, which symmetric ones do not have.
 FRAME_AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
 # The places' loss is the negative log of the right pose's share, each pose weighing energy^-SHARPNESS.
 SHARPNESS = 8.0
@@ -23,6 +23,7 @@ def pair_loss(
     queries: Float[Array, "2 queries 3"],
     inside: Float[Array, "2 queries"],
     centres: Float[Array, "2 3"],
+    sided: Float[Array, "2"],
     shown: Float[Array, "2 box 3"],
     offered: Float[Array, "2 poses box 3"],
 ) -> tuple[Float[Array, ""], dict]:
@@ -35,24 +36,25 @@ def pair_loss(
         queries: relative to the cloud's mean, metres.
         inside: 1 inside the object, 0 outside.
         centres: origins of the objects' frames, relative to the cloud's mean.
+        sided: 1 where the object has a front, 0 where a symmetry leaves it none.
         shown, offered: query points at a place; see `tdf_jax.training.batch.Batch`.
 
     Returns:
         The loss, and its parts by name, one of each object.
     """
-    fields, losses, parts = jax.lax.map(lambda sample: _object_loss(params, config, *sample), (clouds, queries, inside, centres))
+    fields, losses, parts = jax.lax.map(lambda sample: _object_loss(params, config, *sample), (clouds, queries, inside, centres, sided))
     others = jax.tree.map(lambda leaf: leaf[::-1], fields)
     place = jax.lax.map(lambda sample: place_error(*sample), (fields, others, shown, offered))
     return jnp.mean(losses) + PLACE_WEIGHT * jnp.mean(place), parts | {"place": place}
 
 
-def _object_loss(params, config, cloud, queries, inside, centre):
+def _object_loss(params, config, cloud, queries, inside, centre, sided):
     """The field, and binary cross-entropy plus the frame's error with the parts they are reported by."""
     latent = encode_latent(params["network"], config, cloud)
     conditioned = condition(params["network"], config, latent)
     _, logits = decode(conditioned, queries)
     cross_entropy = jnp.mean(optax.sigmoid_binary_cross_entropy(logits, inside))
-    frame = frame_error(params, latent, centre * config.scaling)
+    frame = frame_error(params, latent, centre * config.scaling, sided)
     occupied, truth = logits > 0, inside > 0.5
     parts = {
         "bce": cross_entropy,
@@ -63,8 +65,10 @@ def _object_loss(params, config, cloud, queries, inside, centre):
     return DescriptorField(conditioned, jnp.zeros(3)), cross_entropy + FRAME_WEIGHT * frame, parts
 
 
-def frame_error(params, latent: Float[Array, "latent 3"], centre: Float[Array, "3"]) -> Float[Array, ""]:
-    """Squared error of the object's frame read out of a latent: up, the handle's side, and the frame's origin.
+def frame_error(
+    params, latent: Float[Array, "latent 3"], centre: Float[Array, "3"], sided: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Squared error of the object's frame read out of a latent: up, the front if there is one, and the frame's origin.
 
     Three linear read-outs (`params["frame"]`, (latent, 3), used in training only) of a latent whose vectors turn with the object: a
     vector-neuron network has no bias, so it must find the frame in the cloud, and being equivariant it needs no
@@ -75,9 +79,12 @@ def frame_error(params, latent: Float[Array, "latent 3"], centre: Float[Array, "
         params: see `pair_loss`.
         latent: of a cloud in its canonical orientation.
         centre: origin of the object's frame relative to the cloud's mean, in the network's unit.
+        sided: 1 where the object has a front. An equivariant network gives vectors that turn with the object: of one that half a turn leaves as it is
+            they all lie along the axis, so nothing could be asked of a front.
     """
     truth = jnp.concatenate([jnp.asarray(FRAME_AXES), centre[None]])
-    return jnp.sum((params["frame"].T @ latent - truth) ** 2)
+    asked = jnp.stack([jnp.ones_like(sided), sided, jnp.ones_like(sided)])
+    return jnp.sum(asked[:, None] * (params["frame"].T @ latent - truth) ** 2)
 
 
 def place_error(
