@@ -121,7 +121,7 @@ def test_the_record_tells_all_settings(folder, weights):
     record = record_of(folder)
     assert (record["schema"], record["tdf_jax"], record["seed"]) == (report.SCHEMA, tdf.__version__, 0)
     assert record["settings"] == {
-        "target": None, "scale": 1.0, "target_pose": "random", "demonstration": None, "trajectory": "wave",
+        "target": None, "scale": 1.0, "target_pose": "random", "demonstration": None, "category": "mug", "trajectory": "wave",
         "goal_offset": [0.0, 0.0, 0.0], "k": None, "method": "adam", "inits": 2, "poses": 4, "queries": 8, "iterations": 3, "points": 60,
         "seed": 0, "weights": str(weights), "out": str(folder), "no_plots": False, "json": False,
     }  # fmt: skip
@@ -146,7 +146,7 @@ def test_the_truth_is_the_handle_and_the_goal(folder):
     record = record_of(folder)
     found = tdf.load_trajectory(folder / "trajectory.npz")
     expected = np.array(record["expected"], np.float32)
-    pair = scene.mug_case(0, 0, height=0.12, points=60)
+    pair = scene.generated_case("mug", 0, 0, points=60)
     handle = tdf.Trajectory.from_matrices(np.stack([pair.T_world_place_b] * 2)).wxyz_xyz[0]
     metres, radians = pose_error(expected[0], handle)
     assert metres < 1e-5 and radians < 1e-3
@@ -165,7 +165,7 @@ def test_the_goal_is_the_demonstrations_carried_by_the_centroids_and_offset(imit
     plain = np.array(imitate(*TINY)["goal"])
     offset = np.array(imitate(*TINY, "--goal-offset", "-0.1", "0.2", "0.3")["goal"])
     np.testing.assert_allclose(offset - plain, [0, 0, 0, 0, -0.1, 0.2, 0.3], atol=1e-6)
-    model, pair = tdf.load_model(weights), scene.mug_case(0, 0, height=0.12, points=60)
+    model, pair = tdf.load_model(weights), scene.generated_case("mug", 0, 0, points=60)
     origins = [tdf.encode(model, tdf.thin(points, 40)).origin for points in (pair.points_a, pair.points_b)]
     place = pair.T_world_place_a[:3, 3] + PLACE - origins[0] + origins[1]
     np.testing.assert_allclose(plain, [1, 0, 0, 0, *place], atol=1e-5)
@@ -248,17 +248,17 @@ def test_an_own_target_has_no_truth(imitate, tmp_path, capsys, kind):
 
 def test_scale_and_pose_of_an_own_target(tmp_path):
     np.save(tmp_path / "cloud.npy", cloud := np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32))
-    settings = Settings(target=tmp_path / "cloud.npy", scale=0.1, target_pose="random", poses=3, queries=4)
+    settings = Settings(target=tmp_path / "cloud.npy", category="mug", scale=0.1, target_pose="random", poses=3, queries=4)
     made = scene.make_scene(dataclasses.replace(settings, trajectory="line"), jax.random.key(0))
     T = made.T_world_target
     np.testing.assert_allclose(made.points, 0.1 * cloud @ T[:3, :3].T + T[:3, 3], atol=1e-6)
     assert np.linalg.norm(T - np.eye(4)) > 0.1
-    assert made.meshes[1] is None and made.T_world_handles is None
+    assert made.meshes[1] is None and made.T_world_places is None
 
 
 def test_a_drawn_mesh_lies_where_its_points_do(tmp_path):
     path = mesh_file(tmp_path, "stl")
-    settings = Settings(target=path, target_pose="random", trajectory="line", poses=2, queries=4)
+    settings = Settings(target=path, category="mug", target_pose="random", trajectory="line", poses=2, queries=4)
     for one in (settings, dataclasses.replace(settings, target=None)):
         made = scene.make_scene(one, jax.random.key(0))
         for points, mesh in zip((made.demonstration.points, made.points), made.meshes):
@@ -273,9 +273,9 @@ def test_every_path_can_be_named():
 
 @pytest.mark.parametrize("shape", PATHS)
 def test_generated_demonstrations_go_from_the_handle_to_the_place(shape):
-    settings = Settings(trajectory=shape, poses=5, queries=7, target_pose="given")
+    settings = Settings(category="mug", trajectory=shape, poses=5, queries=7, target_pose="given")
     made = scene.make_scene(settings, jax.random.key(0))
-    shown, (handle_a, handle_b) = made.demonstration, made.T_world_handles
+    shown, (handle_a, handle_b) = made.demonstration, made.T_world_places
     ends = shown.trajectory.matrices
     np.testing.assert_allclose(ends[0], handle_a, atol=1e-6)
     np.testing.assert_allclose(ends[-1, :3, 3] - handle_a[:3, 3], PLACE, atol=1e-6)
@@ -510,7 +510,7 @@ def evaluation(weights, real, tmp_path_factory):
 
 def test_an_evaluation_has_a_row_for_every_method_condition_and_set(evaluation, real):
     methods, conditions = ("small", "random weights", "PCA", "ICP"), ("full", "views1", "half")
-    expected = [(objects, cloud, method) for objects in ("generated mugs", "real meshes") for cloud in conditions for method in methods]
+    expected = [(objects, cloud, method) for objects in ("generated mugs", "real mugs") for cloud in conditions for method in methods]
     evaluation, _ = evaluation
     rows = evaluation["rows"]
     assert [(row["set"], row["clouds"], row["method"]) for row in rows] == expected
@@ -531,7 +531,7 @@ def test_a_plain_evaluation_gives_the_same_numbers_and_a_table(evaluation, weigh
     assert row == evaluation[0]["rows"][0]
     out, _ = capsys.readouterr()
     title, heads, units, line = out.splitlines()
-    assert title == "generated mugs: 2 objects, 2 transfers; handle, best of 2 starts by loss"
+    assert title == "generated mugs: 2 objects, 2 transfers of the handle; best of 2 starts by loss"
     cells = re.split(r"  +", line)
     assert cells[:4] == ["small", "full", f"{row['iou']:.3f}", f"{row['iou_refined']:.3f}"] and cells[-4] == str(row["flips"])
     low, high = row["interval_2cm_20deg"]
@@ -544,8 +544,8 @@ def test_a_model_card_tells_what_the_record_does(evaluation):
     record, card = evaluation
     lines = card.splitlines()
     assert lines[0] == "# small" and "| trained by | a test |" in lines
-    assert "Generated mugs: 2 mugs that no training run saw, 2 transfers." in lines
-    assert "`tdf evaluate --seed 3 --pairs 2 --inits 2 --iterations 2 --meshes DIR --poses 2 --clouds full views1 half`" in card
+    assert "Generated mugs: 2 that no training run saw, 2 transfers of the handle." in lines
+    assert "`tdf evaluate --seed 3 --pairs 2 --inits 2 --iterations 2 --meshes DIR --poses 2 --category mug --clouds full views1 half`" in card
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.count("|") == 11]
     rows = [row for row in rows if row[0] not in ("cloud", "---")]
     assert len(rows) == len(record["rows"]) == 24
@@ -579,8 +579,8 @@ def test_every_condition_can_be_asked_for():
     (("--pairs", "-1", "--meshes", "."), "--pairs is -1"),
     (("--poses", "0"), "--poses is 0"),
     (("--seed", "-1"), "--seed is -1"),
-    (("--height", "12"), "--height is 12.0; expected metres"),
-    (("--place", "spout"), "--place is 'spout'; expected handle, rim or base"),
+    (("--size", "12"), "--size is 12.0; expected metres"),
+    (("--place", "spout"), "--place is 'spout'; expected one of a mug's: handle, rim, base"),
     (("--inits", "0"), "inits is 0"),
     (("--clouds", "fog"), "views1"),
     (("--meshes", "none"), "load_annotated.*there is no folder none"),

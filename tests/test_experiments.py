@@ -116,8 +116,8 @@ def test_the_test_mug_its_mesh_and_its_handle_lie_where_the_truth_says():
     T, mug = scene.T_world_target, settings.mug(setting, 1)
     np.testing.assert_allclose(T[:3, :3], settings.rotation(setting))
     np.testing.assert_allclose(T[:3, 3], (0.1, 0.2, 0.3))
-    np.testing.assert_allclose(scene.T_world_handles[1], T @ mug.handle_frame)
-    np.testing.assert_allclose(scene.T_world_handles[0], settings.mug(setting, 0).handle_frame)
+    np.testing.assert_allclose(scene.T_world_places[1], T @ mug.handle_frame)
+    np.testing.assert_allclose(scene.T_world_places[0], settings.mug(setting, 0).handle_frame)
     np.testing.assert_allclose(scene.meshes[1].vertices, mug.mesh.vertices @ T[:3, :3].T + T[:3, 3])
     low, high = mug.mesh.bounds
     canonical = (scene.points - T[:3, 3]) @ T[:3, :3]

@@ -11,7 +11,7 @@ from tdf_jax import poses
 from tdf_jax.demonstration import Demonstration
 from tdf_jax.errors import InputError
 from tdf_jax.evaluation.cases import SEED_SPACE, Case
-from tdf_jax.evaluation.scene import handle_demonstration
+from tdf_jax.evaluation.scene import place_demonstration
 from tdf_jax.evaluation.transfer import QUERIES, QUERY_SIZE
 from tdf_jax.evaluation.truth import expected_trajectory
 from tdf_jax.paths import PATHS
@@ -71,7 +71,7 @@ def make_task(case: Case, seed: int, index: int) -> Task:
     path = list(PATHS)[index % len(PATHS)]
     displacement = list(DISPLACEMENTS)[index // len(PATHS) % len(DISPLACEMENTS)]
     key = jax.random.fold_in(jax.random.key(seed), QUERY_STREAM)
-    shown = handle_demonstration(case, path, POSES, box_query(key, QUERIES, QUERY_SIZE * case.scale))
+    shown = place_demonstration(case, path, POSES, box_query(key, QUERIES, QUERY_SIZE * case.scale))
     ends = np.asarray(shown.trajectory.wxyz_xyz)[[0, -1], 4:]
     way = np.random.default_rng([SEED_SPACE, seed, index, 3]).normal(size=3)
     length = DISPLACEMENTS[displacement]

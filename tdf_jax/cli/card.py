@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from tdf_jax.cli.scores import GENERATED, THRESHOLDS, Outcomes, overlap_cells, successes
+from tdf_jax.cli.scores import THRESHOLDS, Outcomes, is_real, overlap_cells, place, successes
 from tdf_jax.files import replace_file
 from tdf_jax.model import Model
 from tdf_jax.network import parameter_count
@@ -42,8 +42,8 @@ def card(model: Model, outcomes: Outcomes, settings: dict) -> str:
     for objects in dict.fromkeys(name for name, _ in outcomes):
         rows = [(clouds, outcome) for (name, clouds), several in outcomes.items() if name == objects for outcome in several]
         first = rows[0][1].summary
-        kind = "mugs that no training run saw" if objects == GENERATED else "real mugs, at their own size, none seen in training"
-        lines += [f"{objects.capitalize()}: {first['objects']} {kind}, {first['cases']} transfers.", ""]
+        kind = "at their own size, none seen in training" if is_real(objects) else "that no training run saw"
+        lines += [f"{objects.capitalize()}: {first['objects']} {kind}, {first['cases']} transfers of the {place(objects, settings)}.", ""]
         heads = ["cloud", "method", "IoU", "refined", "position, median / 90 %", "rotation, median / 90 %", "flips", *THRESHOLDS.values()]
         lines += [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
         lines += [f"| {' | '.join(_cells(clouds, outcome))} |" for clouds, outcome in rows]
@@ -64,11 +64,12 @@ def _told(settings: dict) -> str:
     options = {name: settings[name] for name in ("seed", "pairs", "inits", "iterations")}
     if settings["meshes"] is not None:
         options |= {"meshes": "DIR", "poses": settings["poses"]}
-    told = " ".join(f"--{name} {value}" for name, value in (options | {"clouds": " ".join(settings["clouds"])}).items())
+    options |= {"category": " ".join(settings["category"]), "clouds": " ".join(settings["clouds"])}
+    told = " ".join(f"--{name} {value}" for name, value in options.items())
     return (
-        f"One pose at the {settings['place']}, shown on a generated mug of the same height, target in a uniform random pose, best of "
-        f"{settings['inits']} starts by loss (`tdf evaluate {told}`). Success: position and rotation error both within the "
-        "bounds; in brackets the 95 % bootstrap interval over objects."
+        "One pose at a place, shown on a generated object of the same size and symmetry, target in a uniform random pose, best of "
+        f"{settings['inits']} starts by loss (`tdf evaluate {told}`). Errors are from the nearest of the poses that the target's symmetry makes "
+        "equal. Success: position and rotation error both within the bounds; in brackets the 95 % bootstrap interval over objects."
     )
 
 

@@ -1,4 +1,4 @@
-"""`tdf evaluate`: how well weights transfer a pose to unseen generated mugs and to real meshes, beside baselines."""
+"""`tdf evaluate`: how well weights transfer a pose to unseen generated objects and to real meshes, beside baselines."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -6,15 +6,17 @@ from typing import Annotated, Literal
 import tyro
 
 _NONE = "(default: none)"
+Category = Literal["mug", "bowl", "bottle"]
 Cloud = Literal["full", "views1", "views2", "views4", "points300", "points1000", "points3000", "noise", "half", "double", "all"]
 
 
 def evaluate(
     weights: str = "mug",
+    category: Annotated[tuple[Category, ...], tyro.conf.arg(help_behavior_hint="(default: that of shipped weights; mug)")] = (),
     pairs: int = 50,
     seed: int = 0,
-    height: float = 0.12,
-    place: str = "handle",
+    size: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: 0.12, 0.20, 0.22)")] = None,
+    place: Annotated[str | None, tyro.conf.arg(help_behavior_hint="(default: handle, rim, neck)")] = None,
     inits: int = 10,
     iterations: int = 100,
     clouds: tuple[Cloud, ...] = ("full",),
@@ -25,21 +27,22 @@ def evaluate(
     card: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=_NONE)] = None,
     figures: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint=_NONE)] = None,
 ) -> None:
-    """Transfer one pose between unseen mugs, the target under a uniform random rotation, and print the errors.
+    """Transfer one pose between unseen objects, the target under a uniform random rotation, and print the errors.
 
     Args:
         weights: a name of shipped weights, or a .safetensors file.
-        pairs: generated mug pairs; 0 for none, beside --meshes.
-        seed: of the mugs, poses, query points and starts.
-        height: of generated mugs, metres; a real mug keeps its size, and is demonstrated on a generated one of its height.
-        place: handle, rim or base.
+        category: mug, bowl, bottle; several are evaluated one after the other.
+        pairs: generated pairs of each category; 0 for none, beside --meshes.
+        seed: of the objects, poses, query points and starts.
+        size: of generated objects, metres: a mug's height, the diagonal of others; a real one keeps its size, and is demonstrated on a generated one of that.
+        place: of a mug the handle, rim or base; of a bowl the rim, base or body; of a bottle the neck, base or body.
         inits: random starts of each transfer; the one with the least loss counts.
         iterations: Adam steps.
         clouds: the new object's cloud: full; from 1, 2 or 4 cameras; of 300 to 3000 points; 300 with 2 mm noise; half or
             double size.
         baselines: also random weights, alignment of principal axes and ICP, on the same cases with as many starts.
-        meshes: folder of real mugs and their meshes.json; see docs/evaluation.md.
-        poses: random poses of each real mug.
+        meshes: folder of real objects of these categories and their meshes.json; see docs/evaluation.md.
+        poses: random poses of each real object.
         json: write every number to this file.
         card: write a model card in Markdown.
         figures: draw reconstructions and transfers into this folder; needs the extra "mesh".
@@ -49,28 +52,36 @@ def evaluate(
 
     from tdf_jax.checkpoint import load_model
     from tdf_jax.cli import card as cards, scores
+    from tdf_jax.cli.settings import categories_of
+    from tdf_jax.errors import InputError
     from tdf_jax.evaluation.annotated import load_annotated
-    from tdf_jax.evaluation.cases import mesh_case, mug_case
+    from tdf_jax.evaluation.cases import generated_case, mesh_case
     from tdf_jax.evaluation.clouds import CONDITIONS
     from tdf_jax.evaluation.comparison import BASELINES, compare
     from tdf_jax.meshes import libigl
     from tdf_jax.optimize import OptimizeConfig
 
-    _check_numbers(pairs, seed, height, place, clouds, meshes, poses)
+    _check_numbers(pairs, seed, size, clouds, meshes, poses)
+    categories = tuple(dict.fromkeys(category or categories_of(weights)))
+    _check_place(place, categories)
     _check_outputs(json, card, figures)
     if meshes is not None or figures is not None:
         libigl("tdf evaluate")
     config = OptimizeConfig(inits=inits, iterations=iterations)
     settings = {
-        "weights": weights, "pairs": pairs, "seed": seed, "height": height, "place": place, "inits": inits, "iterations": iterations,
+        "weights": weights, "category": categories, "pairs": pairs, "seed": seed, "size": size, "place": place, "inits": inits, "iterations": iterations,
         "meshes": None if meshes is None else str(meshes), "poses": poses, "clouds": clouds,
     }  # fmt: skip
     targets = [] if meshes is None else load_annotated(meshes)
     model = load_model(weights)
-    makers = {
-        scores.GENERATED: [functools.partial(mug_case, seed, index, height=height) for index in range(pairs)],
-        scores.REAL: [functools.partial(mesh_case, seed, pose, target) for target in targets for pose in range(poses)],
-    }
+    unasked = sorted({target.category for target in targets} - set(categories))
+    if unasked:
+        raise InputError(f"tdf evaluate: --meshes has a {unasked[0]}; expected {', '.join(categories)} only; add it to --category, or move it away")
+    makers = {}
+    for name in categories:
+        makers[scores.label(name)] = [functools.partial(generated_case, name, seed, index, size=size) for index in range(pairs)]
+        real = [target for target in targets if target.category == name]
+        makers[scores.label(name, real=True)] = [functools.partial(mesh_case, seed, pose, target) for target in real for pose in range(poses)]
     outcomes = {}
     for objects, several in makers.items():
         for condition in (CONDITIONS if "all" in clouds else dict.fromkeys(clouds)) if several else ():
@@ -89,7 +100,7 @@ def evaluate(
         draw(figures, model, outcomes)
 
 
-def _check_numbers(pairs, seed, height, place, clouds, meshes, poses) -> None:
+def _check_numbers(pairs, seed, size, clouds, meshes, poses) -> None:
     from tdf_jax.errors import InputError
 
     if pairs < 1 and (meshes is None or pairs < 0):
@@ -98,12 +109,19 @@ def _check_numbers(pairs, seed, height, place, clouds, meshes, poses) -> None:
         raise InputError(f"tdf evaluate: --poses is {poses}; expected at least 1")
     if not 0 <= seed < 2**32:
         raise InputError(f"tdf evaluate: --seed is {seed}; expected 0 to {2**32 - 1}")
-    if not 0.01 <= height <= 1.0:
-        raise InputError(f"tdf evaluate: --height is {height}; expected metres between 0.01 and 1")
-    if place not in ("handle", "rim", "base"):
-        raise InputError(f"tdf evaluate: --place is {place!r}; expected handle, rim or base")
+    if size is not None and not 0.01 <= size <= 1.0:
+        raise InputError(f"tdf evaluate: --size is {size}; expected metres between 0.01 and 1")
     if not clouds:
         raise InputError("tdf evaluate: --clouds is empty; expected at least one condition, such as full")
+
+
+def _check_place(place: str | None, categories: tuple[str, ...]) -> None:
+    from tdf_jax.errors import InputError
+    from tdf_jax.shapes import FAMILIES
+
+    for category in categories:
+        if place is not None and place not in FAMILIES[category].places:
+            raise InputError(f"tdf evaluate: --place is {place!r}; expected one of a {category}'s: {', '.join(FAMILIES[category].places)}")
 
 
 def _check_outputs(json: Path | None, card: Path | None, figures: Path | None) -> None:

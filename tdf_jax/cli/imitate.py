@@ -102,7 +102,7 @@ def _draw(folder: Path, scene: Scene, result: Result, rows: str) -> None:
     from tdf_jax.viz.style import save_figure
 
     trajectory = result.trajectory
-    expected = scene.expected(trajectory.wxyz_xyz[-1])
+    expected = scene.expected(trajectory.wxyz_xyz[-1], trajectory.wxyz_xyz[0])
     title = report.title(result.loss, report.errors(trajectory, expected))
     figure = imitation_figure(scene.demonstration, scene.points, trajectory, expected, scene.meshes, title)
     save_figure(folder / "imitation.png", figure)

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from tdf_jax import poses
-from tdf_jax.cli.scores import GENERATED, Outcomes
+from tdf_jax.cli.scores import Outcomes, is_real
 from tdf_jax.errors import InputError
 from tdf_jax.evaluation.comparison import Outcome
 from tdf_jax.evaluation.transfer import QUERY_SIZE
@@ -19,7 +19,7 @@ MOST_GENERATED = 6
 
 
 def draw(folder: Path, model: Model, outcomes: Outcomes) -> None:
-    """Draw the first condition: up to `MOST_GENERATED` generated mugs, and every real one in its first pose.
+    """Draw the first condition: up to `MOST_GENERATED` generated objects of a category, and every real one in its first pose.
 
     Args:
         folder: made if it is missing; pictures in it are replaced.
@@ -35,7 +35,7 @@ def draw(folder: Path, model: Model, outcomes: Outcomes) -> None:
         if clouds == condition:
             names = [case.instance for case in outcome.cases]
             firsts = [names.index(name) for name in dict.fromkeys(names)]
-            panels += [_panel(model, outcome, index) for index in firsts[: MOST_GENERATED if objects == GENERATED else None]]
+            panels += [_panel(model, outcome, index) for index in firsts[: None if is_real(objects) else MOST_GENERATED]]
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:

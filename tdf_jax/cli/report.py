@@ -55,7 +55,7 @@ def record(
 ) -> dict:
     """Everything about a run that result.json holds; numbers that are not finite are null."""
     trajectory = result.trajectory
-    expected = scene.expected(trajectory.wxyz_xyz[-1])
+    expected = scene.expected(trajectory.wxyz_xyz[-1], trajectory.wxyz_xyz[0])
     demonstration = scene.demonstration
     return {
         "schema": SCHEMA,

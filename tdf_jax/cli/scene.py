@@ -1,4 +1,4 @@
-"""What `tdf imitate` and `tdf landscape` work on: a demonstration and a target, from the user's files or a pair of generated mugs."""
+"""What `tdf imitate` and `tdf landscape` work on: a demonstration and a target, from the user's files or a pair of generated objects."""
 
 import dataclasses
 
@@ -8,16 +8,14 @@ from jaxtyping import PRNGKeyArray
 from tdf_jax.cli.settings import SceneSettings
 from tdf_jax.demonstration import Demonstration
 from tdf_jax.errors import InputError
-from tdf_jax.evaluation.cases import Case, mug_case, random_pose
-from tdf_jax.evaluation.scene import Scene, handle_demonstration
+from tdf_jax.evaluation.cases import Case, generated_case, random_pose
+from tdf_jax.evaluation.scene import Scene, place_demonstration
 from tdf_jax.evaluation.transfer import QUERY_SIZE
 from tdf_jax.meshes import load_mesh
 from tdf_jax.pointcloud import load_points
 from tdf_jax.query import box_query
 from tdf_jax.recording import load_demonstration
 from tdf_jax.trajectory import resample
-
-MUG_HEIGHT = 0.12  # metres
 
 
 def make_scene(settings: SceneSettings, key: PRNGKeyArray) -> Scene:
@@ -31,15 +29,15 @@ def make_scene(settings: SceneSettings, key: PRNGKeyArray) -> Scene:
         InputError: a file that cannot be used, or a number that makes no trajectory.
     """
     shown, found = _read_demonstration(settings), _read_target(settings)
-    pair, shown_mesh, handles = None, None, None
+    pair, shown_mesh, places = None, None, None
     T_world_target = np.eye(4) if settings.target_pose == "given" else random_pose(settings.seed, 0)
     if shown is None or found is None:  # after the files: a bad one is told at once
-        pair = mug_case(settings.seed, 0, height=MUG_HEIGHT, points=settings.points)
+        pair = generated_case(settings.category, settings.seed, 0, points=settings.points)
     if found is None:
-        T_mug_world = np.linalg.inv(pair.T_world_b)
-        found = _moved(pair.points_b, T_mug_world), pair.object_b.mesh
+        T_object_world = np.linalg.inv(pair.T_world_b)
+        found = _moved(pair.points_b, T_object_world), pair.object_b.mesh
         if shown is None:
-            handles = (pair.T_world_place_a, T_world_target @ T_mug_world @ pair.T_world_place_b)
+            places = (pair.T_world_place_a, T_world_target @ T_object_world @ pair.T_world_place_b)
     if shown is None:
         shown, shown_mesh = _generated(settings, pair, key), pair.object_a.mesh
     points, mesh = found
@@ -47,8 +45,9 @@ def make_scene(settings: SceneSettings, key: PRNGKeyArray) -> Scene:
         demonstration=shown,
         points=_moved(points, T_world_target),
         T_world_target=T_world_target,
-        T_world_handles=handles,
+        T_world_places=places,
         meshes=(shown_mesh, None if mesh is None else mesh.copy().apply_transform(T_world_target)),
+        fold=1 if places is None else pair.fold,
     )
 
 
@@ -73,7 +72,7 @@ def _read_target(settings: SceneSettings):
 
 
 def _generated(settings: SceneSettings, pair: Case, key: PRNGKeyArray) -> Demonstration:
-    return handle_demonstration(pair, settings.trajectory, settings.poses, box_query(key, settings.queries, QUERY_SIZE))
+    return place_demonstration(pair, settings.trajectory, settings.poses, box_query(key, settings.queries, QUERY_SIZE))
 
 
 def _moved(points, T):

@@ -11,22 +11,38 @@ from tdf_jax.evaluation.comparison import Outcome
 from tdf_jax.evaluation.transfer import OVERLAPS
 from tdf_jax.files import replace_file
 from tdf_jax.model import Model
+from tdf_jax.shapes import FAMILIES
 
-SCHEMA = 1  # raised when a field of the file changes its meaning or goes
-GENERATED, REAL = "generated mugs", "real meshes"
+SCHEMA = 2  # raised when a field of the file changes its meaning or goes
 THRESHOLDS = {"5mm_5deg": "5 mm, 5 deg", "1cm_10deg": "1 cm, 10 deg", "2cm_20deg": "2 cm, 20 deg"}
 
 Outcomes = Mapping[tuple[str, str], Sequence[Outcome]]  # by objects and condition of the cloud
 
 
+def label(category: str, real: bool = False) -> str:
+    """What objects of a category are called in tables and files."""
+    return f"{'real' if real else 'generated'} {category}s"
+
+
+def is_real(objects: str) -> bool:
+    """Whether a `label` is of real objects."""
+    return objects.startswith("real ")
+
+
+def place(objects: str, settings: dict) -> str:
+    """The place that is transferred on objects of a `label`."""
+    category = objects.split()[1].removesuffix("s")
+    return settings["place"] or FAMILIES[category].places[0]
+
+
 def table(outcomes: Outcomes, settings: dict) -> str:
     """One line for every method under every condition, the objects apart."""
-    told = f"{settings['place']}, best of {settings['inits']} starts by loss"
+    told = f"best of {settings['inits']} starts by loss"
     lines = []
     for objects in dict.fromkeys(name for name, _ in outcomes):
         rows = [(clouds, outcome) for (name, clouds), several in outcomes.items() if name == objects for outcome in several]
         first = rows[0][1].summary
-        lines += ["", f"{objects}: {first['objects']} objects, {first['cases']} transfers; {told}"]
+        lines += ["", f"{objects}: {first['objects']} objects, {first['cases']} transfers of the {place(objects, settings)}; {told}"]
         lines += _aligned([_HEADS, _UNITS, *(_cells(clouds, outcome) for clouds, outcome in rows)])
     return "\n".join(lines[1:])
 

@@ -9,6 +9,7 @@ import tyro
 
 from tdf_jax.errors import InputError
 from tdf_jax.route import SHARPEST
+from tdf_jax.shapes import FAMILIES
 
 SEEDS = 2**32  # jax cuts a larger one to 32 bits without a word
 
@@ -27,7 +28,8 @@ class SceneSettings:
         scale: metres per unit of the target file: 0.01 for centimetres.
         target_pose: how the target lies in the world: as its file says, or moved by a random rotation and translation.
         demonstration: .npz with points (N, 3), wxyz_xyz (n, 7) and query (Q, 3), in metres.
-        trajectory: shape of a generated demonstration, from the handle to a place 0.30 m away.
+        category: of generated objects.
+        trajectory: shape of a generated demonstration, from a mug's handle, a bowl's rim or a bottle's neck to a place 0.30 m away; lift_over sets it down on a shelf there.
         poses: of the trajectory; a demonstration file is resampled to another number.
         queries: query points of a generated demonstration.
         points: drawn from a mesh, or from a larger cloud.
@@ -35,16 +37,17 @@ class SceneSettings:
         weights: a name of shipped weights, or a .safetensors file.
     """
 
-    target: Annotated[Path | None, _option("FILE", "a generated mug")] = None
+    target: Annotated[Path | None, _option("FILE", "a generated object")] = None
     scale: float = 1.0
-    target_pose: Annotated[Literal["given", "random"] | None, _option(default="given for a file, random for a generated mug")] = None
-    demonstration: Annotated[Path | None, _option("FILE", "one on another generated mug")] = None
-    trajectory: Annotated[Literal["line", "semicircle", "wave", "lift_over", "tilt_and_pour", "hang_on_rack"] | None, _option(default="wave")] = None
+    target_pose: Annotated[Literal["given", "random"] | None, _option(default="given for a file, random for a generated object")] = None
+    demonstration: Annotated[Path | None, _option("FILE", "one on another generated object")] = None
+    category: Annotated[Literal["mug", "bowl", "bottle"] | None, _option(default="that of shipped weights; mug")] = None
+    trajectory: Annotated[Literal["line", "semicircle", "wave", "lift_over", "tilt_and_pour", "hang_on_rack"] | None, _option(default="wave of a mug, lift_over of others")] = None
     poses: Annotated[int | None, _option("INT", "7, or those of the demonstration file")] = None
     queries: Annotated[int | None, _option("INT", "128")] = None
     points: int = 1500
     seed: int = 0
-    weights: Annotated[str, _option("NAME|FILE")] = "mug"
+    weights: Annotated[str | None, _option("NAME|FILE", "those of the category")] = None
 
     COMMAND: ClassVar[str] = "tdf"
 
@@ -120,6 +123,13 @@ class LandscapeSettings(SceneSettings):
     COMMAND: ClassVar[str] = "tdf landscape"
 
 
+def categories_of(weights: str | None) -> tuple[str, ...]:
+    """Categories that shipped weights were made for; mugs, of other files."""
+    if weights == "multi":
+        return tuple(FAMILIES)
+    return (weights,) if weights in FAMILIES else ("mug",)
+
+
 def resolved(settings: SceneSettings) -> SceneSettings:
     """The settings with the defaults filled in that depend on others.
 
@@ -127,6 +137,8 @@ def resolved(settings: SceneSettings) -> SceneSettings:
         InputError: a bad number, or options that contradict each other.
     """
     _check_numbers(settings)
+    category = settings.category or categories_of(settings.weights)[0]
+    settings = dataclasses.replace(settings, category=category, weights=settings.weights or category)
     generated = "random"
     if isinstance(settings, LandscapeSettings):
         generated = "given"
@@ -137,7 +149,7 @@ def resolved(settings: SceneSettings) -> SceneSettings:
         return dataclasses.replace(
             settings,
             target_pose=pose,
-            trajectory=settings.trajectory or "wave",
+            trajectory=settings.trajectory or ("wave" if category == "mug" else "lift_over"),
             poses=7 if settings.poses is None else settings.poses,
             queries=128 if settings.queries is None else settings.queries,
         )

@@ -13,12 +13,11 @@ from tdf_jax.demonstration import Reference
 from tdf_jax.descriptor import pose_descriptor
 from tdf_jax.energy import EnergyWeights
 from tdf_jax.evaluation.cases import Case, Transfer
-from tdf_jax.evaluation.truth import pose_error
+from tdf_jax.evaluation.truth import nearest_place, pose_error
 from tdf_jax.model import Model, encode
 from tdf_jax.optimize import OptimizeConfig, optimize
 from tdf_jax.query import box_query
 from tdf_jax.refinement import refine
-from tdf_jax.symmetry import equivalent
 from tdf_jax.trajectory import Trajectory
 
 OVERLAPS = ("iou", "iou_refined")
@@ -56,18 +55,12 @@ def place_errors(
     found: Float[np.ndarray, "cases 7"], cases: Sequence[Transfer]
 ) -> tuple[Float[np.ndarray, "cases"], Float[np.ndarray, "cases"]]:
     """Position errors, metres, and rotation errors, degrees, of poses found for cases: from the nearest of a symmetric object's true poses."""
-    truth = np.stack([_true_place(*pair) for pair in zip(found, cases, strict=True)]).astype(np.float32)
+    T_world_found = np.asarray(Trajectory(jnp.asarray(found)).matrices, float)
+    truth = np.stack(
+        [nearest_place(case.T_world_b, T, case.T_world_place_b, case.fold) for T, case in zip(T_world_found, cases, strict=True)]
+    ).astype(np.float32)
     distance, angle = pose_error(found, poses.pose(truth[:, :3, :3], truth[:, :3, 3]))
     return distance, np.degrees(angle)
-
-
-def _true_place(found, case: Transfer):
-    """T_world_place, 4x4, of the place's equivalents nearest to where it was found."""
-    to_object = np.linalg.inv(case.T_world_b)
-    T_world_found = np.eye(4)
-    T_world_found[:3, :3], T_world_found[:3, 3] = poses.rotation(found), poses.translation(found)
-    T_object_found = to_object @ T_world_found
-    return case.T_world_b @ equivalent(T_object_found, to_object @ case.T_world_place_b, case.fold, QUERY_SIZE / 2 * case.scale)
 
 
 def place_reference(model: Model, case: Transfer, query: Float[Array, "queries 3"]) -> Reference:

@@ -6,8 +6,10 @@ from jaxtyping import Array, Float
 
 from tdf_jax import poses
 from tdf_jax.carry import carry_trajectory
+from tdf_jax.symmetry import equivalent
 from tdf_jax.trajectory import Trajectory
 
+REACH = 0.03  # metres from a place at which its equivalents are compared; half of a query box
 FLIP_DEGREES = 170.0  # rotation errors above it are counted apart: the object was taken for its mirror image
 
 
@@ -34,6 +36,27 @@ def expected_trajectory(
     pick_motion = jnp.asarray(T_world_place_b @ np.linalg.inv(T_world_place_a), demonstrated.wxyz_xyz.dtype)
     pick = poses.compose(poses.pose(pick_motion[:3, :3], pick_motion[:3, 3]), demonstrated.wxyz_xyz[0])
     return carry_trajectory(demonstrated, pick, goal)
+
+
+def nearest_place(
+    T_world_object: Float[np.ndarray, "4 4"], T_world_found: Float[np.ndarray, "4 4"], T_world_place: Float[np.ndarray, "4 4"], fold: int
+) -> Float[np.ndarray, "4 4"]:
+    """Of the places that an object's symmetry makes equal, the one nearest to where one was found.
+
+    Args:
+        T_world_object: pose of the object's canonical frame.
+        T_world_found: of the place, as found.
+        T_world_place: of one true place.
+        fold: the object's symmetry, see `tdf_jax.symmetry`.
+
+    Returns:
+        T_world_place, 4x4.
+    """
+    if fold == 1:
+        return T_world_place
+    to_object = np.linalg.inv(T_world_object)
+    found = to_object @ np.asarray(T_world_found, float)
+    return T_world_object @ equivalent(found, to_object @ T_world_place, fold, REACH)
 
 
 def pose_error(found: Float[Array, "... 7"], truth: Float[Array, "... 7"]) -> tuple[np.ndarray, np.ndarray]:

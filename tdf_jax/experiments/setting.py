@@ -198,7 +198,7 @@ def scene(setting: Setting) -> Scene:
         demonstration=Demonstration(points_a, trajectory, query(setting)),
         points=(points_b @ T_world_b[:3, :3].T + T_world_b[:3, 3]).astype(np.float32),
         T_world_target=T_world_b,
-        T_world_handles=(a.handle_frame, T_world_b @ b.handle_frame),
+        T_world_places=(a.handle_frame, T_world_b @ b.handle_frame),
         meshes=(a.mesh, b.mesh.copy().apply_transform(T_world_b)),
     )
 

@@ -16,18 +16,18 @@ class Family(NamedTuple):
         build: parameters -> `Shape`.
         sample: a numpy generator -> parameters.
         places: names of the frames every object of it has; the first is where demonstrations pick it.
-        height: of a common one, metres.
+        size: of a common one, metres: a mug's height, the diagonal of others.
     """
 
     build: Callable
     sample: Callable
     places: tuple[str, ...]
-    height: float
+    size: float
 
 
 FAMILIES = {
     "mug": Family(build_mug, sample_mug, ("handle", "rim", "base"), 0.12),
-    "bowl": Family(build_bowl, sample_bowl, ("rim", "base", "body"), 0.07),
+    "bowl": Family(build_bowl, sample_bowl, ("rim", "base", "body"), 0.20),
     "bottle": Family(build_bottle, sample_bottle, ("neck", "base", "body"), 0.22),
 }
 

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from tdf_jax.errors import InputError
 from tdf_jax.shapes.shape import Clay, Shape, check_numbers, frame, is_one_body, moulded
 from tdf_jax.shapes.solid import Loft, bar_line, bends_freely, encloses, inset, section, swept, tube_rings
+from tdf_jax.symmetry import ROUND
 
 SHOULDERS = ("arc", "slope")
 
@@ -71,6 +72,15 @@ class BottleParameters:
     handle_width: float = 0.016
     handle_thickness: float = 0.011
 
+    @property
+    def fold(self) -> int:
+        """Symmetry about z: 1 of bottles with a handle, 0 of round ones, 2 of flat and 4 of square ones."""
+        if self.handle:
+            return 1
+        if self.aspect < 1:
+            return 2
+        return ROUND if self.squareness == 2 else 4
+
 
 @dataclass(frozen=True, eq=False)
 class Bottle(Shape):
@@ -82,14 +92,6 @@ class Bottle(Shape):
 
     category = "bottle"
     unitless = ("aspect", "squareness", "shoulder_style", "shoulder_curve", "neck_taper", "cap_taper", "handle")
-
-    @property
-    def fold(self) -> int:
-        """1 of bottles with a handle, 0 of round ones, 2 of flat and 4 of square ones."""
-        p = self.parameters
-        if p.handle:
-            return 1
-        return 2 if p.aspect < 1 else 0 if p.squareness == 2 else 4
 
     @staticmethod
     def clay_of(parameters: BottleParameters) -> Clay:

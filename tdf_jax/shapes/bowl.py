@@ -11,6 +11,7 @@ from jaxtyping import Float
 from tdf_jax.errors import InputError
 from tdf_jax.shapes.shape import Clay, Shape, check_numbers, frame, is_one_body, moulded
 from tdf_jax.shapes.solid import Loft, inset, section
+from tdf_jax.symmetry import ROUND
 
 _PROFILE = 60  # points along the side's profile
 _FLARE_FROM = 0.8  # of the side's height: where a flared or drawn-in rim begins
@@ -48,6 +49,13 @@ class BowlParameters:
     foot_width: float = 0.005
     lip_radius: float = 0.0015
 
+    @property
+    def fold(self) -> int:
+        """Symmetry about z: 0 of round bowls, 2 of oval ones and rectangles, 4 of square ones."""
+        if self.aspect < 1:
+            return 2
+        return ROUND if self.squareness == 2 else 4
+
 
 @dataclass(frozen=True, eq=False)
 class Bowl(Shape):
@@ -59,13 +67,6 @@ class Bowl(Shape):
 
     category = "bowl"
     unitless = ("aspect", "squareness", "curve")
-
-    @property
-    def fold(self) -> int:
-        """0 of round bowls, 2 of oval ones and rectangles, 4 of square ones."""
-        if self.parameters.aspect < 1:
-            return 2
-        return 0 if self.parameters.squareness == 2 else 4
 
     @staticmethod
     def clay_of(parameters: BowlParameters) -> Clay:

@@ -68,6 +68,11 @@ class MugParameters:
     handle_squareness: float = 2.0
     handle_flare: float = 1.15
 
+    @property
+    def fold(self) -> int:
+        """Symmetry about z, 1: the handle tells all sides apart."""
+        return 1
+
 
 @dataclass(frozen=True, eq=False)
 class Mug(Shape):
@@ -75,11 +80,6 @@ class Mug(Shape):
 
     category = "mug"
     unitless = ("squareness", "handle_style", "handle_squareness", "handle_flare")
-
-    @property
-    def fold(self) -> int:
-        """1: the handle tells all sides apart."""
-        return 1
 
     @property
     def handle_frame(self) -> Float[np.ndarray, "4 4"]:

@@ -41,9 +41,9 @@ class Shape(ABC):
     frames: dict[str, Float[np.ndarray, "4 4"]]
 
     @property
-    @abstractmethod
     def fold(self) -> int:
-        """How many turns about z leave the object as it is: 1 none but a full one, 2 half turns, 4 quarters, 0 any (`tdf_jax.symmetry`)."""
+        """Its symmetry about z: 1 none, 2 half turns, 4 quarters, 0 any turn leave it as it is (`tdf_jax.symmetry`)."""
+        return self.parameters.fold
 
     @property
     def height(self) -> float:

@@ -1,0 +1,250 @@
+"""Semantic places of bowls' and bottles' meshes, measured on sections through their axis.
+
+They are those of `tdf_jax.shapes.Bowl` and `tdf_jax.shapes.Bottle`: the canonical frame's origin on the axis at half the height, z up, the front along +x, and
+frames T_object_place of a bowl's rim, base and body and of a bottle's neck, base and body. Surfaces may be open: nothing is asked of the inside.
+"""
+
+import dataclasses
+from collections.abc import Collection
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from tdf_jax.errors import InputError
+from tdf_jax.evaluation.places import BELOW_RIM, crossings, frame
+from tdf_jax.symmetry import FOLDS, ROUND
+
+if TYPE_CHECKING:
+    import trimesh
+
+DIRECTIONS = 48  # half planes about the axis, a multiple of 8
+LEVELS = 400  # 0.5 mm apart on a common bottle
+AXIS_LEVELS = 100
+# Where the middle of an object without symmetry is its axis, shares of the height: a bottle's cap is above all handles, a bowl's lower half below all spouts.
+AXIS_FROM = {"bowl": (0.1, 0.5), "bottle": (0.9, 1.0)}
+TURNS = {ROUND: (1 / 8, 1 / 4), 2: (1 / 2,), 4: (1 / 4,)}  # of a full one, that leave an outline as it is
+CHANGE = 0.15  # of the radius: by how much a turn may change it still
+OFF_FRONT = 10.0  # degrees
+SHAPELESS = 0.02  # strength of an outline's harmonic below which it has no direction: an ellipse 3 % longer than wide
+NARROWER = 0.85  # of the body's radius: the widest neck that is one
+STANDS_ON = 0.75  # of the body's radius: how wide a bottle is at an eighth of its height; one that lies is 0.66
+CURVES = (1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0)  # of the shoulders tried, `BottleParameters.shoulder_curve`
+
+
+@dataclasses.dataclass(frozen=True)
+class Profile:
+    """How far an object reaches from its axis.
+
+    Attributes:
+        origin: on the axis at half the height, in the frame it was measured in, (3,), metres.
+        height: metres.
+        sections: for each direction, evenly about the axis from +x on, the surface in the plane through the axis: segments (segments, 2, 2) of (distance
+            from the axis that way, height above the origin), metres.
+        radii: the outermost surface by level, upwards, and direction, metres; NaN where there is none.
+    """
+
+    origin: Float[np.ndarray, "3"]
+    height: float
+    sections: tuple[Float[np.ndarray, "_ 2 2"], ...]
+    radii: Float[np.ndarray, "levels directions"]
+
+
+def profile(mesh: "trimesh.Trimesh", category: str, fold: int, name: str) -> Profile:
+    """Find the axis of a bowl or bottle whose front points along +x, z up, and measure it from there.
+
+    Args:
+        mesh: metres.
+        category: "bowl" or "bottle".
+        fold: its symmetry, see `tdf_jax.symmetry`.
+        name: of the mesh, for messages.
+
+    Raises:
+        InputError: the mesh does not have this symmetry about z, or its front is elsewhere.
+    """
+    low = mesh.vertices[np.unique(mesh.faces), 2].min()
+    axis = np.append(_axis(mesh, (0.0, 1.0) if fold != 1 else AXIS_FROM[category], name), low)
+    sections = _sections(mesh, axis)
+    # Of the highest point in each direction the median: the rim of a scan leans, and stray vertices must not raise it.
+    tops = [section[(section[..., 0] > 0).any(axis=1), :, 1].max(initial=-np.inf) for section in sections]
+    height = float(np.median([top for top in tops if top > -np.inf]))
+    sections = tuple(section - [0.0, height / 2] for section in sections)
+    radii = np.stack([_outermost(section, _levels(height)) for section in sections], axis=1)
+    found = Profile(axis + [0, 0, height / 2], height, sections, radii)
+    _check_symmetry(found, mesh.bounds - found.origin, fold, name)
+    return found
+
+
+def profile_places(
+    profile: Profile, category: str, fold: int, name: str, places: Collection[str]
+) -> dict[str, Float[np.ndarray, "4 4"]]:
+    """Frames of the places of a bowl or bottle.
+
+    Args:
+        profile: of the mesh.
+        category: "bowl" or "bottle".
+        fold: its symmetry, see `tdf_jax.symmetry`.
+        name: of the mesh, for messages.
+        places: those to measure, of its family's.
+
+    Returns:
+        T_object_place, 4x4, metres, by the names of `tdf_jax.shapes.FAMILIES`.
+
+    Raises:
+        InputError: the mesh is not an open bowl with a wall, or not a bottle with a neck on a body, where a place to be measured needs it.
+    """
+    half = profile.height / 2
+    found = {"base": frame(0.0, -half)}
+    if category == "bowl":
+        found["body"] = frame(0.0, 0.0)
+        if "rim" in places:
+            found["rim"] = frame(_rim(profile, fold, name), half)
+    elif set(places) - set(found):
+        neck, body = _bottle_levels(profile, fold, name)
+        found |= {"neck": frame(0.0, neck), "body": frame(0.0, body)}
+    return {place: found[place] for place in places}
+
+
+def _levels(height: float) -> np.ndarray:
+    return ((np.arange(LEVELS) + 0.5) / LEVELS - 0.5) * height
+
+
+def _axis(mesh, shares: tuple[float, float], name: str) -> np.ndarray:
+    """Where the axis is, (x, y): the middle of the extents across of horizontal sections, the median over those at these shares of the height."""
+    from trimesh.intersections import mesh_plane
+
+    low, high = mesh.bounds[:, 2]
+    levels = low + (high - low) * (shares[0] + (shares[1] - shares[0]) * (np.arange(AXIS_LEVELS) + 0.5) / AXIS_LEVELS)
+    cuts = (mesh_plane(mesh, plane_normal=[0, 0, 1], plane_origin=[0, 0, level])[..., :2].reshape(-1, 2) for level in levels)
+    # The middle of an outline is its axis for every symmetry, while the mean of its points follows how densely a side was scanned; the middle of the whole
+    # box is thrown off by one stray vertex, and of a scanned bowl by 0.4 mm by its leaning rim.
+    middles = [(cut.min(axis=0) + cut.max(axis=0)) / 2 for cut in cuts if len(cut)]
+    if not middles:
+        raise InputError(
+            f"profile(): {name} has no surface from {100 * shares[0]:.0f} to {100 * shares[1]:.0f} % of its height, where its axis is found; "
+            "expected one; repair the mesh, or correct its 'up'"
+        )
+    return np.median(middles, axis=0)
+
+
+def _sections(mesh, axis: np.ndarray) -> list[np.ndarray]:
+    """The surface in the plane of each direction, both sides of the axis, from a point on it."""
+    from trimesh.intersections import mesh_plane
+
+    there = []
+    for angle in np.arange(DIRECTIONS // 2) * (2 * np.pi / DIRECTIONS):
+        along, across = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([-np.sin(angle), np.cos(angle), 0.0])
+        # Beside the axis by less than any mesh is accurate: vertices lie in these planes themselves, often whole edges.
+        cut = mesh_plane(mesh, plane_normal=across, plane_origin=axis + 1e-6 * across) - axis
+        there.append(np.stack([cut @ along, cut[..., 2]], axis=-1))
+    return there + [section * [-1.0, 1.0] for section in there]
+
+
+def _outermost(section: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """The greatest first coordinate at each level of the second, NaN where none is positive; as `crossings`, at once."""
+    first, last = (np.searchsorted(levels, end) for end in (section[..., 1].min(axis=1), section[..., 1].max(axis=1)))
+    segment = np.repeat(np.arange(len(section)), last - first)
+    level = np.arange(len(segment)) - np.repeat(np.cumsum(last - first) - last, last - first)
+    a, b = section[segment, 0], section[segment, 1]
+    reach = np.full(len(levels), -np.inf)
+    np.maximum.at(reach, level, a[:, 0] + (levels[level] - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0]))
+    return np.where(reach > 0, reach, np.nan)
+
+
+def _check_symmetry(found: Profile, bounds: np.ndarray, fold: int, name: str) -> None:
+    def refuse(what, expected):
+        raise InputError(f"profile(): {name} {what}; expected {expected}")
+
+    if fold == 1:
+        front, others = bounds[1, 0], max(-bounds[0, 0], bounds[1, 1], -bounds[0, 1])
+        if front < 0.9 * others:
+            refuse(f"reaches {100 * front:.1f} cm to its front and {100 * others:.1f} cm to another side", "a handle or longer side there; correct 'front'")
+        return
+    middle = found.radii[LEVELS // 4 : -LEVELS // 4]
+    around = np.array([np.median(way[way > 0]) if (way > 0).any() else np.nan for way in middle.T])  # NaN: a hole
+    mean = np.nanmean(around) if (around > 0).any() else np.nan
+    for turn in TURNS[fold]:
+        change = float(np.nanquantile(np.abs(around - np.roll(around, round(turn * DIRECTIONS))), 0.9)) / mean
+        if not change < CHANGE:
+            refuse(f"is not {FOLDS[fold]}: a turn by {360 * turn:g} degrees about 'up' changes its outline by {100 * change:.0f} % of its radius",
+                   f"{100 * CHANGE:.0f} % at most; correct 'symmetry' or 'up'")
+    if fold == ROUND:
+        return
+    angles = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
+    harmonic = np.nansum(around**2 * np.exp(1j * fold * angles)) / np.nansum(around**2)
+    turned = np.degrees(np.angle(harmonic if fold == 2 else -harmonic)) / fold  # corners of a square lie beside its front
+    if abs(harmonic) > SHAPELESS and abs(turned) > OFF_FRONT:
+        c, s = np.cos(np.radians(turned)), np.sin(np.radians(turned))
+        refuse(f"has its {'longer side' if fold == 2 else 'flat side'} {turned:.0f} degrees from 'front', counter-clockwise about 'up'",
+               f"{OFF_FRONT:g} at most; give 'front' as a direction [x, y, z] of the file: {c:.4f} of the present front and {s:.4f} of that to its left")
+
+
+def _rim(found: Profile, fold: int, name: str) -> float:
+    """How far from the axis the middle of the wall is at the rim, on the +x side and those that the symmetry makes equal: the median."""
+    if crossings(found.sections[0][..., ::-1], 0.0).max(initial=-np.inf) > found.height / 4:
+        raise _unmeasured(name, "it is closed above; is 'up' right?", "a bowl, open above")
+    middles = []
+    for section in found.sections[:: 1 if fold == ROUND else DIRECTIONS // fold]:
+        side = section[(section[..., 0] > 0).all(axis=1)]
+        wall = crossings(side, side[..., 1].max(initial=-np.inf) - BELOW_RIM * found.height)  # below the top on this side: a rim may lean
+        if len(wall) > 1:
+            middles.append(wall[-2:].mean())
+    if not middles:
+        raise _unmeasured(name, "its rim on the front is no wall with two sides", "a bowl with a wall")
+    return float(np.median(middles))
+
+
+def _bottle_levels(found: Profile, fold: int, name: str) -> tuple[float, float]:
+    """Heights of the neck's and the body's places."""
+    radius, height = _mean_radius(found, fold), found.height
+    levels = _levels(height) + height / 2
+    wanted = "a bottle with a neck above its body"
+    body = float(np.quantile(radius[: LEVELS // 2], 0.9))  # not the greatest: a seam; not the median: a waist
+    neck = float(np.quantile(radius[LEVELS // 2 :], 0.2))
+    for _ in range(4):  # the neck is what is above the shoulder's middle, which is half way between body and neck; settles after two
+        below = (radius < (body + neck) / 2) & (np.arange(LEVELS) >= LEVELS // 4)
+        if neck > NARROWER * body or not below.any():
+            raise _unmeasured(name, "nothing above its body is narrow enough for a neck; is 'up' right?", wanted)
+        above = int(np.argmax(below))
+        neck = float(np.median(radius[above:]))  # so a cap counts by its length, wider or narrower
+    if radius[LEVELS // 8] < STANDS_ON * body:
+        raise _unmeasured(name, f"it narrows from {200 * body:.1f} to {200 * radius[LEVELS // 8]:.1f} cm below; is 'up' right?", wanted)
+    half_way = float(np.interp((body + neck) / 2, radius[[above, above - 1]], levels[[above, above - 1]]))
+    body_to = _shoulder_from(levels[LEVELS // 8 : above], radius[LEVELS // 8 : above], half_way, neck, height)
+    return half_way / 2, (body_to - height) / 2
+
+
+def _mean_radius(found: Profile, fold: int) -> np.ndarray:
+    """By level: the median over directions, over the back ones of an object with a handle."""
+    radii = found.radii[:, DIRECTIONS // 4 : 3 * DIRECTIONS // 4 + 1] if fold == 1 else found.radii
+    seen = (radii > 0).any(axis=1)
+    if seen.mean() < 0.5:
+        return np.zeros(LEVELS)
+    return np.interp(np.arange(LEVELS), np.flatnonzero(seen), np.nanmedian(radii[seen], axis=1))
+
+
+def _shoulder_from(levels: np.ndarray, radius: np.ndarray, half_way: float, neck: float, height: float) -> float:
+    """Level above the base where the body ends.
+
+    Of the shoulders of `BottleParameters` that are half as wide at `half_way`, on bodies with any bulge, the one that fits best up to there. The highest level
+    with 95 % of the body's radius was tried: it is in the middle of a dome, up to 46 mm too high on a bottle of 0.3 m.
+    """
+    best, level = np.inf, half_way
+    shoulders = [(curve, (1 - 0.5**curve) ** (1 / curve)) for curve in CURVES] + [(None, 0.5)]  # None: a slope; with the share of it at half_way
+    for start in np.arange(0.3 * half_way, half_way, 0.005 * height):
+        share = np.maximum(levels - start, 0) / (half_way - start)
+        s = np.minimum(levels / start, 1)
+        for curve, middle in shoulders:
+            if start + (half_way - start) / middle > height:
+                continue
+            wide = (1 + np.cos(np.pi * middle * share)) / 2 if curve is None else np.maximum(1 - (middle * share) ** curve, 0) ** (1 / curve)
+            parts = np.stack([wide, 4 * s * (1 - s)], axis=1)  # the body's radius and its bulge
+            rest = radius - neck * (1 - wide)
+            off = np.abs(parts @ np.linalg.lstsq(parts, rest, rcond=None)[0] - rest).sum()  # not squared: seams and labels
+            if off < best:
+                best, level = off, start
+    return float(level)
+
+
+def _unmeasured(name: str, what: str, expected: str) -> InputError:
+    return InputError(f"profile_places(): {name} cannot be measured: {what} Expected {expected}: correct its 'up', or give 'places' for it")
