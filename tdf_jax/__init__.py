@@ -14,7 +14,7 @@ from tdf_jax.energy import (
     descriptor_loss,
     trajectory_energy,
 )
-from tdf_jax.errors import InputError
+from tdf_jax.errors import CategoryWarning, InputError
 from tdf_jax.field import DescriptorField
 from tdf_jax.grid import Grid, path_grid, plane_grid, volume_grid
 from tdf_jax.imitation import imitate, imitate_batch
@@ -28,9 +28,20 @@ from tdf_jax.optimize import OptimizeConfig, Result, optimize
 from tdf_jax.paths import hang_on_rack, lift_over, line, semicircle, tilt_and_pour, wave
 from tdf_jax.pointcloud import load_points, thin
 from tdf_jax.query import box_query, gaussian_query, gripper_query, lattice_query, snapped_query
+from tdf_jax.recognition import recognition, surface_logit
 from tdf_jax.refinement import refine
 from tdf_jax.route import lowest_cost_path
-from tdf_jax.shapes import MugParameters, build_mug, sample_mug
+from tdf_jax.shapes import (
+    BottleParameters,
+    BowlParameters,
+    MugParameters,
+    build_bottle,
+    build_bowl,
+    build_mug,
+    sample_bottle,
+    sample_bowl,
+    sample_mug,
+)
 from tdf_jax.solve import SolveConfig, solve
 from tdf_jax.sweep import energy_landscape
 from tdf_jax.trajectory import Trajectory, displace, load_trajectory, resample, save_trajectory

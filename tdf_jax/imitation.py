@@ -1,6 +1,7 @@
 """Imitation, the whole way in one call: demonstration + new object's cloud -> trajectory."""
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 
 import jax
@@ -11,11 +12,14 @@ from tdf_jax.carry import CarryConfig, carry
 from tdf_jax.confidence import CALIBRATED
 from tdf_jax.demonstration import Demonstration, Reference, describe
 from tdf_jax.energy import EnergyWeights
-from tdf_jax.errors import InputError
+from tdf_jax.errors import CategoryWarning, InputError
 from tdf_jax.keys import check_key
 from tdf_jax.model import Model, encode
 from tdf_jax.optimize import OptimizeConfig, Result, default_goal, optimize
+from tdf_jax.recognition import CURVES, recognition, surface_logit
 from tdf_jax.solve import SolveConfig, solve
+
+DOUBT = 0.5  # probability of the demonstration's category below which a warning is issued
 
 
 def imitate(
@@ -53,7 +57,8 @@ def imitate(
         progress, mesh: see `solve` and `optimize`.
 
     Returns:
-        The result; `.trajectory` is the best one, T_world_query.
+        The result; `.trajectory` is the best one, T_world_query. A `CategoryWarning` is issued if the object is more likely of another category than the demonstration's, where that is
+        known: for shipped weights, and the default config.
 
     Raises:
         InputError: bad points, goal, offset or settings, or an energy that `carry` would not use.
@@ -72,9 +77,22 @@ def imitate(
     settings = {"goal": goal, "fix_last": fix_last, "progress": progress, "mesh": mesh}
     if isinstance(config, CarryConfig):
         result = carry(field, reference, key, config=config, **settings)
-        return result if model.info.name in CALIBRATED else dataclasses.replace(result, confidence=None)
+        return _judged(result, model.info.name, field, points)
     minimise = optimize if isinstance(config, OptimizeConfig) else solve
     return minimise(field, reference, key, energy=EnergyWeights() if energy is None else energy, config=config, **settings)
+
+
+def _judged(result: Result, weights: str, field, points) -> Result:
+    """The result with what shipped weights are calibrated for: how likely the pick is right, and the object one of their category."""
+    recognised = recognition(result.residual, surface_logit(field, points), CURVES[weights]) if weights in CURVES else None
+    if recognised is not None and recognised < DOUBT:
+        warnings.warn(
+            f"imitate(): the object does not look like one of the demonstration's category to the weights {weights!r} (probability {recognised:.2g}); check the target, its unit and "
+            "the weights",
+            CategoryWarning,
+            stacklevel=3,
+        )
+    return dataclasses.replace(result, recognised=recognised, confidence=result.confidence if weights in CALIBRATED else None)
 
 
 def imitate_batch(

@@ -71,7 +71,7 @@ class OptimizeConfig:
 
 
 @functools.partial(
-    jax.tree_util.register_dataclass, data_fields=["trajectories", "losses", "energies", "starts", "residual", "confidence"], meta_fields=[]
+    jax.tree_util.register_dataclass, data_fields=["trajectories", "losses", "energies", "starts", "residual", "confidence", "recognised"], meta_fields=[]
 )
 @dataclasses.dataclass(frozen=True)
 class Result:
@@ -84,6 +84,7 @@ class Result:
         starts: (inits, poses, 7), where they began.
         residual: of `carry`: what the best pick leaves of the demonstration's descriptors, see `tdf_jax.confidence`; None of others.
         confidence: of `carry`: how likely the pick is right, in [0, 1], see there; None of others, and of `imitate` with weights that it is not calibrated for.
+        recognised: of `imitate` with shipped weights: how likely the object is of the demonstration's category, in [0, 1], see `tdf_jax.recognition`; None of others.
     """
 
     trajectories: Float[Array, "inits poses 7"]
@@ -92,6 +93,7 @@ class Result:
     starts: Float[Array, "inits poses 7"]
     residual: float | None = None
     confidence: float | None = None
+    recognised: float | None = None
 
     @property
     def finite(self) -> Bool[np.ndarray, "inits"]:

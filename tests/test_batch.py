@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from tdf_jax.training import batch, dataset
 from tdf_jax.training.batch import DIAGONALS, PAIR_SPREAD, draw, validation_pairs
-from tdf_jax.training.dataset import Recipe
+from tdf_jax.training.dataset import DataSet, Recipe
 
 SIZES = {"pairs": 3, "points": 200, "queries": 50, "box": 12, "poses": 6}
 
@@ -135,3 +136,127 @@ def test_validation_pairs_show_every_object_once_at_one_size(objects):
     for cloud, centre, points in zip(view.clouds, view.centres, seen):
         distances = np.linalg.norm((cloud - centre)[:, None] - points, axis=-1)
         assert distances.min(axis=1).max() < 1e-6
+
+
+# ---- symmetric objects, and several sources ----
+
+
+def many(objects, folds, sources):
+    """The given objects over and over, with these symmetries and sources: what a batch asks of them does not depend on their shapes."""
+    indices = np.resize(np.arange(len(objects.surface)), len(folds))
+    repeated = {field.name: getattr(objects, field.name)[indices] for field in dataclasses.fields(DataSet)}
+    return DataSet(**(repeated | {"fold": np.array(folds, np.int8), "source": np.array(sources)}))
+
+
+def drawn_indices(data, monkeypatch, pairs, seed=0):
+    """Which objects a batch is of, (pairs, 2)."""
+    asked, sensed = [], batch._sensed
+
+    def noted(data, rng, index, corruption, points):
+        asked.append(int(index))
+        return sensed(data, rng, index, corruption, points)
+
+    monkeypatch.setattr(batch, "_sensed", noted)
+    made = drawn(data, seed, pairs=pairs, points=6, queries=2, box=2, poses=2)
+    return np.reshape(asked, (pairs, 2)), made
+
+
+def test_sources_are_drawn_alike_however_many_objects_they_have(objects, monkeypatch):
+    data = many(objects, [1] * 12, [0] + [1] * 9 + [2] * 2)
+    found, _ = drawn_indices(data, monkeypatch, 400)
+    shares = np.bincount(data.source[found[:, 0]]) / 400
+    np.testing.assert_allclose(shares, 1 / 3, atol=0.1)  # four standard deviations
+    assert set(found[:, 0]) == set(range(12))
+
+
+def test_partners_are_of_the_same_source_and_symmetry(objects, monkeypatch):
+    folds, sources = [0, 2, 0, 2, 0, 1, 1, 0], [0, 0, 0, 0, 1, 1, 1, 1]
+    data = many(objects, folds, sources)
+    found, made = drawn_indices(data, monkeypatch, 200)
+    for first, partner in found:
+        assert (folds[first], sources[first]) == (folds[partner], sources[partner])
+    met = {tuple(pair) for pair in found.tolist()}
+    assert met == {(a, b) for kind in ((0, 2), (1, 3), (4, 7), (5, 6)) for a in kind for b in kind}
+    # Only an object without any symmetry has a front.
+    np.testing.assert_array_equal(made.sided, (np.array(folds)[found] == 1).astype(np.float32))
+
+
+@pytest.fixture
+def diagonal(monkeypatch):
+    """Of every pair, metres."""
+    for name in ("DIAGONALS", "USUAL_DIAGONALS"):
+        monkeypatch.setattr(batch, name, (0.2, 0.2))
+    return 0.2
+
+
+def least_distance(wrong, right, centre, fold):
+    """Root mean square distance of a pose's query points from where the right pose has them after any allowed turn about the object's axis."""
+    angles = np.arange(fold or 720) * 2 * np.pi / (fold or 720)
+    turns = Rotation.from_euler("z", angles[:, None]).as_matrix()
+    copies = np.einsum("tij,pj->tpi", turns, right - centre) + centre
+    return np.sqrt(np.mean(np.sum((copies - wrong) ** 2, axis=-1), axis=-1)).min()
+
+
+@pytest.mark.parametrize("fold", [0, 2, 4])
+def test_wrong_poses_are_wrong_for_every_turn_a_symmetry_allows(objects, diagonal, monkeypatch, fold):
+    """Poses on the axis are turned about it by any angle, some moved off as well: those that a symmetry makes right are not among the wrong ones."""
+    monkeypatch.setattr(batch, "FIRST_SHARE", 0.0)  # of a mug, the place that is not on the axis
+    monkeypatch.setattr(batch, "REMOTE_SHARE", 0.0)
+    offered_turns = []
+
+    def turned(rng, right, diagonal):
+        wrong, angle = right.copy(), rng.choice([0, 2, 3, 4, 5]) * np.pi / 4
+        offered_turns.append(round(np.degrees(angle)))
+        wrong[:3, :3] = Rotation.from_euler("z", angle).as_matrix() @ right[:3, :3]
+        wrong[:3, 3] += rng.choice([0.0, 0.003, 0.05]) * np.array([0, 0, 1])
+        return wrong
+
+    monkeypatch.setattr(batch, "_wrong", turned)
+    bases = dataclasses.replace(many(objects, [fold] * 3, [0] * 3), places=objects.places[:, [0, 2, 2]])
+    found = []
+    for sample, partner in pairs_of(drawn(bases, 1, pairs=12, poses=5)):
+        right, *wrong = sample["offered"].astype(float)
+        found += [least_distance(one, right, partner["centres"], fold) for one in wrong]
+    assert np.min(found) > batch.LEAST_WRONG * diagonal - 1e-4
+    assert set(offered_turns) == {0, 90, 135, 180, 225}
+    assert len(offered_turns) > len(found)  # some were thrown away
+
+
+@pytest.mark.parametrize("fold", [0, 2, 4])
+def test_wrong_poses_as_training_draws_them_are_wrong_for_every_turn(objects, diagonal, fold, monkeypatch):
+    monkeypatch.setattr(batch, "NEAR_ANGLES", (0.5, 90.0))
+    monkeypatch.setattr(batch, "NEAR_DISTANCES", (0.001, 0.3))
+    data = many(objects, [fold] * 3, [0] * 3)
+    found = [
+        least_distance(wrong.astype(float), sample["offered"][0].astype(float), partner["centres"], fold)
+        for sample, partner in pairs_of(drawn(data, 2, pairs=12, poses=12))
+        for wrong in sample["offered"][1:]
+    ]
+    assert np.min(found) > batch.LEAST_WRONG * diagonal - 1e-5
+    assert np.mean(np.array(found) < 0.1 * diagonal) > 0.05  # not only far ones
+
+
+def test_of_objects_without_symmetry_turned_poses_and_close_ones_are_wrong(objects, diagonal, monkeypatch):
+    """They are taken as they are drawn."""
+    asked = []
+
+    def turned(rng, right, diagonal):
+        wrong = right.copy()
+        wrong[:3, :3] = Rotation.from_euler("z", [180, 1][len(asked) % 2], degrees=True).as_matrix() @ right[:3, :3]
+        asked.append(wrong)
+        return wrong
+
+    monkeypatch.setattr(batch, "_wrong", turned)
+    made = drawn(many(objects, [1] * 3, [0] * 3), 1, pairs=2, poses=5)
+    assert len(asked) == 2 * 2 * 4  # none was drawn again
+    assert (made.sided == 1).all()
+
+
+def test_validation_pairs_are_of_one_kind_and_tell_which_objects_have_a_front(objects):
+    data = many(objects, [0, 1, 0, 1, 2, 1], [0, 0, 0, 0, 0, 1])
+    pairs = validation_pairs(data, 100, 12, 6, one_view=False)
+    assert len(pairs) == 2  # the two-fold one and the one of another source have no partner
+    for pair, (a, b) in zip(pairs, ((0, 2), (1, 3)), strict=True):
+        np.testing.assert_array_equal(pair.inside, data.inside[[a, b], :500])
+        np.testing.assert_array_equal(pair.sided, data.fold[[a, b]] == 1)
+        assert pair.sided.dtype == np.float32 and pair.sided.shape == (2,)

@@ -631,6 +631,6 @@ def test_every_start_non_finite_is_told(refusal, weights, monkeypatch):
 
 
 def test_commands_are_the_functions_of_their_modules():
-    assert set(command_line.COMMANDS) == {"imitate", "landscape", "convert", "evaluate", "benchmark", "dataset", "train", "reproduce"}
+    assert set(command_line.COMMANDS) == {"imitate", "landscape", "convert", "evaluate", "benchmark", "shapes", "dataset", "train", "reproduce"}
     for name in command_line.COMMANDS:
         assert callable(getattr(sys.modules[f"tdf_jax.cli.{name}"], name))

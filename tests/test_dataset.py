@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 
 from tdf_jax.errors import InputError
 from tdf_jax.meshes import sample_surface
-from tdf_jax.shapes import build_mug, sample_mug
+from tdf_jax.shapes import FAMILIES, build_mug, sample_mug
 from tdf_jax.training import dataset, objects
-from tdf_jax.training.dataset import Recipe, build, load
+from tdf_jax.training.dataset import DataSet, Recipe, build, joined, load
 from tdf_jax.training.objects import BOX_PADDING, canonical_mesh, generated_object, scanned_object
 
 BOX = trimesh.creation.box()
@@ -125,6 +125,39 @@ def test_places_of_a_scanned_mesh_are_its_box_and_stretch_with_it(meshes):
 
 
 @pytest.mark.parametrize(
+    "category, seed, fold",
+    [("mug", 0, 1), ("bowl", 0, 2), ("bowl", 1, 0), ("bowl", 18, 4), ("bottle", 0, 2), ("bottle", 1, 0), ("bottle", 3, 1), ("bottle", 12, 4)],
+)
+def test_objects_of_every_family_have_its_places_in_order_and_their_own_symmetry(category, seed, fold):
+    found = generated_object(category, np.random.default_rng([5, seed]), points=100, queries=100, cameras=4)
+    family = FAMILIES[category]
+    shape = family.build(family.sample(np.random.default_rng([5, seed])))
+    assert found.fold == shape.fold == fold and found.fold.dtype == np.int8
+    np.testing.assert_allclose(found.diagonal, np.linalg.norm(shape.mesh.extents), rtol=1e-6)
+    for place, name in zip(found.places, family.places, strict=True):
+        expected = shape.frames[name].copy()
+        expected[:3, 3] /= found.diagonal
+        np.testing.assert_allclose(place, expected, atol=1e-6)
+    np.testing.assert_array_equal(shape.contains(found.queries.astype(float) * found.diagonal), found.inside)
+
+
+@pytest.mark.parametrize("fold", [0, 1, 2, 4])
+def test_meshes_of_quarter_turns_and_more_stretch_alike_along_x_and_y(fold):
+    """So they stay as symmetric as they are; others stretch along every axis on its own."""
+    pytest.importorskip("igl")
+    box = trimesh.creation.box(extents=(0.3, 0.2, 0.1))
+    found = scanned_object(box, np.random.default_rng(3), 100, 100, 4, stretch=0.4, fold=fold)
+    assert found.fold == fold and found.fold.dtype == np.int8
+    sides = 2 * found.places[1:4, [0, 1, 2], [3, 3, 3]].diagonal() * found.diagonal  # the middles of three faces
+    factors = sides / (0.3, 0.2, 0.1)
+    assert np.abs(np.log(factors)).max() <= 0.4 and np.abs(np.log(factors[0] / factors[2])) > 0.02
+    if fold in (0, 4):
+        np.testing.assert_allclose(factors[0], factors[1], rtol=1e-5)
+    else:
+        assert np.abs(np.log(factors[0] / factors[1])) > 0.02
+
+
+@pytest.mark.parametrize(
     ("mesh", "message"),
     [
         (trimesh.creation.box(extents=(1, 1, 1e-4)), "encloses next to nothing"),
@@ -200,6 +233,21 @@ def test_a_folder_of_meshes_is_split_and_repeated_stretched(meshes, tmp_path):
         quiet_build(scanned_recipe(meshes), tmp_path / "data")
 
 
+def test_the_recipes_symmetry_is_that_of_its_meshes(meshes, tmp_path):
+    pytest.importorskip("igl")
+    quiet_build(scanned_recipe(meshes, fold=4), tmp_path / "data")
+    for part in load(tmp_path / "data"):
+        assert (part.fold == 4).all()
+    training, _ = load(tmp_path / "data")
+    faces = training.places[:, [1, 2, 3], [0, 1, 2], 3]  # middles of the faces at +x, +y and +z
+    # The fourth and the fifth object are the first and the second once more, stretched alike along x and y.
+    again = faces[3:] / faces[:2]
+    np.testing.assert_allclose(again[:, 0], again[:, 1], rtol=1e-5)
+    assert np.abs(again[:, 0] / again[:, 2] - 1).min() > 0.01
+    with pytest.raises(InputError, match=r"holds another data set \(fold differ\)"):
+        quiet_build(scanned_recipe(meshes, fold=0), tmp_path / "data")
+
+
 def test_processes_give_the_same(tmp_path):
     """Started afresh, they see nothing of this test's patches, so with the shipped number of occluders."""
     recipe = dataclasses.replace(RECIPE, objects=2)
@@ -209,6 +257,110 @@ def test_processes_give_the_same(tmp_path):
     quiet_build(recipe, tmp_path / "two", workers=2)
     for a, b in zip(load(tmp_path / "one"), load(tmp_path / "two")):
         same(a, b)
+
+
+def test_a_data_set_of_another_family_has_its_objects_and_their_symmetries(tmp_path):
+    quiet_build(dataclasses.replace(RECIPE, category="bottle", objects=5), tmp_path / "data")
+    training, validation = load(tmp_path / "data")
+    for index in range(5):
+        expected = generated_object("bottle", np.random.default_rng([5, index]), 200, 400, 4)
+        for name, array in expected._asdict().items():
+            np.testing.assert_array_equal(getattr(training, name)[index], array)
+    assert len(set(training.fold.tolist())) > 1
+    assert not training.source.any() and not validation.source.any()
+    with pytest.raises(InputError, match=r"holds another data set \(category differ\)"):
+        quiet_build(dataclasses.replace(RECIPE, category="bowl", objects=5), tmp_path / "data")
+
+
+def made_before_symmetries(folder):
+    """Takes out of a data set of mugs what was not there before there were families and symmetric objects."""
+    manifest = json.loads((folder / "dataset.json").read_text())
+    for name in ("category", "fold"):
+        del manifest["recipe"][name]
+    (folder / "dataset.json").write_text(json.dumps(manifest))
+    for path in folder.glob("*.npz"):
+        with np.load(path) as arrays:
+            arrays = dict(arrays)
+        del arrays["fold"]
+        np.savez(path, **arrays)
+
+
+def test_data_sets_made_before_symmetries_load_and_go_on_being_built(tmp_path):
+    quiet_build(RECIPE, tmp_path / "new")
+    quiet_build(RECIPE, tmp_path / "old")
+    made_before_symmetries(tmp_path / "old")
+    for a, b in zip(load(tmp_path / "old"), load(tmp_path / "new")):
+        same(a, b)
+        assert (a.fold == 1).all() and a.digest() == b.digest()
+    (tmp_path / "old" / "training-0001.npz").unlink()
+    quiet_build(RECIPE, tmp_path / "old")
+    for a, b in zip(load(tmp_path / "old"), load(tmp_path / "new")):
+        same(a, b)
+    with pytest.raises(InputError, match=r"holds another data set \(category differ\)"):
+        quiet_build(dataclasses.replace(RECIPE, category="bowl"), tmp_path / "old")
+
+
+def some(folds, sources=None, places=3, seed=0):
+    """A data set of random numbers whose objects have these symmetries."""
+    rng, count = np.random.default_rng(seed), len(folds)
+    return DataSet(
+        surface=rng.normal(size=(count, 6, 3)).astype(np.float32),
+        queries=rng.normal(size=(count, 8, 3)).astype(np.float32),
+        inside=rng.uniform(size=(count, 8)) < 0.5,
+        visible=rng.uniform(size=(count, 4, 6)) < 0.5,
+        places=rng.normal(size=(count, places, 4, 4)).astype(np.float32),
+        diagonal=rng.uniform(size=count).astype(np.float32),
+        fold=np.array(folds, np.int8),
+        source=np.zeros(count, int) if sources is None else np.array(sources),
+    )
+
+
+def test_kinds_are_of_one_source_and_symmetry_and_pairs_of_one_kind():
+    data = some([0, 4, 0, 2, 0, 4, 0, 1], sources=[0, 0, 0, 0, 1, 1, 1, 1])
+    assert [members.tolist() for members in data.sources] == [[0, 1, 2, 3], [4, 5, 6, 7]]
+    assert sorted(members.tolist() for members in data.kinds) == [[0, 2], [1], [3], [4, 6], [5], [7]]
+    for index, number in enumerate(data.kind):
+        assert index in data.kinds[number]
+    assert sorted(data.pairs().tolist()) == [[0, 2], [4, 6]]  # those without another of their kind are left out
+    odd = some([1, 1, 1, 1, 1])
+    assert [members.tolist() for members in odd.kinds] == [[0, 1, 2, 3, 4]]
+    np.testing.assert_array_equal(odd.kind, 0)
+    assert odd.pairs().tolist() == [[0, 1], [2, 3]]
+    assert some([0, 1, 2, 4]).pairs().shape == (0, 2)
+
+
+def test_joined_data_sets_are_numbered_in_their_order():
+    first, second, third = some([1, 1]), some([0, 2, 0], seed=1), some([1], seed=2)
+    data = joined([first, second, third])
+    np.testing.assert_array_equal(data.source, [0, 0, 1, 1, 1, 2])
+    np.testing.assert_array_equal(data.fold, [1, 1, 0, 2, 0, 1])
+    for field in dataclasses.fields(DataSet):
+        if field.name != "source":
+            whole = np.concatenate([getattr(one, field.name) for one in (first, second, third)])
+            np.testing.assert_array_equal(getattr(data, field.name), whole)
+            assert getattr(data, field.name).dtype == getattr(first, field.name).dtype
+    # Of one symmetry, but of other sources: places do not mean the same on them.
+    assert sorted(members.tolist() for members in data.kinds) == [[0, 1], [2, 4], [3], [5]]
+
+
+def test_one_data_set_joined_is_itself():
+    one = some([1, 0, 2])
+    same(joined([one]), one)
+    assert joined([one]).digest() == one.digest()
+
+
+def test_data_sets_with_other_counts_are_not_joined():
+    with pytest.raises(InputError, match=r"joined\(\): the data sets differ in places; expected as many points, queries, cameras and places"):
+        joined([some([1, 1]), some([0, 0], places=7)])
+    fewer = some([1, 1])
+    fewer = dataclasses.replace(fewer, surface=fewer.surface[:, :5], visible=fewer.visible[:, :, :5])
+    with pytest.raises(InputError, match="differ in surface, visible; expected"):
+        joined([some([1, 1]), fewer])
+
+
+@pytest.mark.xfail(strict=True, reason="the digest leaves the symmetry out")
+def test_a_data_set_of_another_symmetry_is_another_one():
+    assert some([1, 1]).digest() != some([0, 0]).digest()
 
 
 # ---- bad input ----
@@ -224,6 +376,10 @@ def test_processes_give_the_same(tmp_path):
         ({"up": "z"}, "'z' is no axis; expected one of"),
         ({"up": "+x", "front": "-x"}, r"up is \+x and front is -x, which are parallel"),
         ({"stretch": 2.0}, "stretch is 2.0"),
+        ({"category": "cup"}, "category is 'cup'; expected one of mug, bowl, bottle"),
+        ({"meshes": ".", "fold": 3}, "fold is 3; expected one of 0, 1, 2, 4"),
+        ({"fold": 2}, "fold is for meshes; generated objects know theirs; drop it"),
+        ({"fold": 0, "category": "bowl"}, "fold is for meshes"),
     ],
 )
 def test_bad_recipes(changes, message):

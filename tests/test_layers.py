@@ -12,7 +12,7 @@ import tdf_jax
 PACKAGE = Path(tdf_jax.__file__).parent
 ORDER = """
     errors keys files poses symmetry trajectory paths query meshes pointcloud views network field model refinement obstacles clearance checkpoint torch_pickle convert
-    descriptor demonstration recording energy devices descent confidence optimize solve carry modes grid landscape lattice sweep route imitation
+    descriptor demonstration recording energy devices descent confidence recognition optimize solve carry modes grid landscape lattice sweep route imitation
     shapes evaluation benchmark training viz experiments cli
 """.split()
 FILES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")

@@ -47,8 +47,27 @@ def ranking(predicted: Float[np.ndarray, " picks"], right: Float[np.ndarray, " p
     return float(np.mean((good[:, None] > bad) + 0.5 * (good[:, None] == bad)))
 
 
+def logistic(features: Float[np.ndarray, "cases features"], right: Float[np.ndarray, " cases"]) -> Float[np.ndarray, "1+features"]:
+    """Intercept and slopes of the logistic curve of maximal likelihood, by Newton's method.
+
+    Args:
+        features: of each case.
+        right: 1 or 0.
+    """
+    x = np.column_stack([np.ones(len(features)), features])
+    weights = np.zeros(x.shape[1])
+    for _ in range(100):
+        p = 1 / (1 + np.exp(-x @ weights))
+        # A faint pull to zero keeps it finite where right and wrong do not overlap.
+        step = np.linalg.solve(x.T @ (x * (p * (1 - p))[:, None]) + 1e-3 * np.eye(len(weights)), x.T @ (right - p) - 1e-3 * weights)
+        weights += step
+        if np.abs(step).max() < 1e-9:
+            break
+    return weights
+
+
 def fit(residual: Float[np.ndarray, " picks"], right: Float[np.ndarray, " picks"]) -> tuple[float, float]:
-    """Intercept and slope of `tdf_jax.confidence` of maximal likelihood, by Newton's method.
+    """Intercept and slope of `tdf_jax.confidence` of maximal likelihood.
 
     Args:
         residual: of picks.
@@ -60,13 +79,5 @@ def fit(residual: Float[np.ndarray, " picks"], right: Float[np.ndarray, " picks"
     residual, right = np.asarray(residual, float), np.asarray(right, float)
     if not (np.isfinite(residual) & (residual > 0)).all() or len(set(right)) != 2:
         raise InputError("fit(): expected residuals above 0, some of picks that were right and some of others")
-    x = np.stack([np.ones(len(residual)), -np.log(residual)], axis=1)
-    weights = np.zeros(2)
-    for _ in range(100):
-        p = 1 / (1 + np.exp(-x @ weights))
-        # A faint pull to zero keeps it finite where right and wrong do not overlap.
-        step = np.linalg.solve(x.T @ (x * (p * (1 - p))[:, None]) + 1e-3 * np.eye(2), x.T @ (right - p) - 1e-3 * weights)
-        weights += step
-        if np.abs(step).max() < 1e-9:
-            break
-    return float(weights[0]), float(weights[1])
+    intercept, slope = logistic(-np.log(residual)[:, None], right)
+    return float(intercept), float(slope)

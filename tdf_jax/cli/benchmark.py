@@ -59,6 +59,9 @@ def benchmark(
     if meshes is not None:
         libigl("tdf benchmark")
     targets = [] if meshes is None else load_annotated(meshes)
+    for target in targets:
+        if target.category != "mug":
+            raise InputError(f"tdf benchmark: --meshes has {target.name}, a {target.category}; expected mugs; tdf evaluate measures others")
     model = load_model(weights)
     folder = _folder(out)
     makers = [make for condition in dict.fromkeys(clouds) for make in _makers(pairs, seed, height, condition, targets, poses)]

@@ -2,7 +2,9 @@
 
 import contextlib
 import json
+import sys
 import time
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
@@ -19,7 +21,7 @@ from tdf_jax.cli.scene import make_scene
 from tdf_jax.cli.settings import Settings, resolved
 from tdf_jax.demonstration import describe
 from tdf_jax.energy import EnergyWeights
-from tdf_jax.errors import InputError
+from tdf_jax.errors import CategoryWarning, InputError
 from tdf_jax.evaluation.scene import Scene
 from tdf_jax.files import replace_file, replace_folder
 from tdf_jax.imitation import imitate as imitate_scene
@@ -58,22 +60,26 @@ def _run(settings: Settings, folder: Path) -> dict:
     with _timed(seconds, "encode"):
         reference = jax.block_until_ready(describe(model, scene.demonstration))
     with _timed(seconds, "optimise"), _progress(_steps(config)) as progress:
-        result = imitate_scene(
-            model,
-            reference,
-            scene.points,
-            key=start_key,
-            goal_offset=np.array(settings.goal_offset),
-            energy=energy,
-            config=config,
-            progress=progress,
-        )
+        with warnings.catch_warnings(record=True) as doubts:
+            warnings.simplefilter("always", CategoryWarning)
+            result = imitate_scene(
+                model,
+                reference,
+                scene.points,
+                key=start_key,
+                goal_offset=np.array(settings.goal_offset),
+                energy=energy,
+                config=config,
+                progress=progress,
+            )
         trajectory = jax.block_until_ready(result.trajectory)
     save_trajectory(folder / "trajectory.npz", trajectory)
     save_trajectory(folder / "trajectory.tum", trajectory)
     if not settings.no_plots:
         with _timed(seconds, "plots"):
             _draw(folder, scene, result, "start" if isinstance(config, OptimizeConfig) else "candidate")
+    for doubt in doubts:
+        print(f"tdf: warning: {doubt.message}", file=sys.stderr)
     seconds["total"] = time.perf_counter() - began
     record = report.record(settings, model, scene, energy, config, result, seconds)
     replace_file("tdf imitate", folder / report.RESULT, json.dumps(record, indent=1).encode())

@@ -76,6 +76,7 @@ def record(
         "best": result.best,
         "loss": {"start": float(result.losses[result.best, 0]), "end": result.loss},
         "confidence": result.confidence,
+        "recognised": result.recognised,
         "modes": _modes(config, result),
         "errors": errors(trajectory, expected),
         "goal": _plain(trajectory.wxyz_xyz[-1]),
@@ -113,6 +114,8 @@ def table(record: dict, out: Path) -> str:
     }
     if record["modes"] is not None:
         rows["solutions"] = _solutions(record["modes"])
+    if record["recognised"] is not None:
+        rows["recognised"] = f"{record['recognised']:.2f} that the object is of the demonstration's category"
     if record["confidence"] is not None:
         rows["confidence"] = f"{record['confidence']:.2f} that the pick is right to 2 cm and 20 degrees"
     return "\n".join(f"{name:<17}{value}" for name, value in rows.items())

@@ -88,10 +88,10 @@ def measured_places(
         section = _section(mesh)
         levels = (np.arange(LEVELS) + 0.5) / LEVELS * height - height / 2
         # On the side without the handle, outer surface last.
-        walls = [np.sort(-row[row < 0]) for row in (_crossings(section, level) for level in levels)]
+        walls = [np.sort(-row[row < 0]) for row in (crossings(section, level) for level in levels)]
         if any(len(row) < 2 for row in walls[3 * LEVELS // 4 : -LEVELS // 100]):
             raise _unmeasured(name, "its upper quarter is no open cup with a wall; is 'up' right?")
-        if _crossings(section[..., ::-1], 0.0).max(initial=-np.inf) > height / 4:
+        if crossings(section[..., ::-1], 0.0).max(initial=-np.inf) > height / 4:
             raise _unmeasured(name, "it is closed above; is 'up' right?")
         found["rim"] = frame(-float(walls[-1 - int(BELOW_RIM * LEVELS)][-2:].mean()), height / 2, -1.0)
         if "handle" in places:
@@ -115,10 +115,10 @@ def _grip(section, height: float, walls, name: str) -> tuple[float, float]:
     low, high = section[..., 1].min(), section[..., 1].max()
     levels = np.arange(low + step / 2, high, step)
     wall = np.interp(levels, (np.arange(LEVELS) + 0.5) * step - height / 2, outer)
-    crossings = [_crossings(section, level) for level in levels]
+    rows = [crossings(section, level) for level in levels]
     middles = []
     for clear in (share * height for share in CLEAR):
-        beyond = np.array([np.sum(row > edge + clear) for row, edge in zip(crossings, wall)])
+        beyond = np.array([np.sum(row > edge + clear) for row, edge in zip(rows, wall)])
         # Going outward from here, an odd number of surfaces is crossed from within clay, an even one from within air.
         arm = np.flatnonzero(beyond % 2)
         gaps = np.diff(arm)
@@ -129,7 +129,7 @@ def _grip(section, height: float, walls, name: str) -> tuple[float, float]:
     near, far = np.array(middles)
     share = (CLEAR[0] * height + thickness / 2) / ((CLEAR[1] - CLEAR[0]) * height)
     z = float(np.mean(near + share * (near - far)))
-    bar = _crossings(section, z)[-2:]  # inner and outer surface
+    bar = crossings(section, z)[-2:]  # inner and outer surface
     if bar[0] < np.interp(z, levels, wall) + CLEAR[0] * height:
         raise _unmeasured(name, "its handle is open half way between its ends")
     return float(bar.mean()), z
@@ -143,7 +143,7 @@ def _section(mesh) -> np.ndarray:
     return mesh_plane(mesh, plane_normal=[0, 1, 0], plane_origin=[0, 1e-6, 0])[..., [0, 2]]
 
 
-def _crossings(section, level: float) -> np.ndarray:
+def crossings(section, level: float) -> np.ndarray:
     """Where segments cross the line at a second coordinate, sorted."""
     a, b = section[:, 0], section[:, 1]
     crossing = (a[:, 1] > level) != (b[:, 1] > level)

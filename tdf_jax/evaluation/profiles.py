@@ -25,9 +25,9 @@ AXIS_LEVELS = 100
 AXIS_FROM = {"bowl": (0.1, 0.5), "bottle": (0.9, 1.0)}
 TURNS = {ROUND: (1 / 8, 1 / 4), 2: (1 / 2,), 4: (1 / 4,)}  # of a full one, that leave an outline as it is
 CHANGE = 0.15  # of the radius: by how much a turn may change it still
-OFF_FRONT = 10.0  # degrees
-SHAPELESS = 0.02  # strength of an outline's harmonic below which it has no direction: an ellipse 3 % longer than wide
-NARROWER = 0.85  # of the body's radius: the widest neck that is one
+LEAST_FRONT = 0.9  # of the reach to the other sides: less of a reach is not to the front
+SHAPELESS = 0.02  # strength of an outline's harmonic below which it has no direction: an ellipse 4 % longer than wide
+NARROWER = 0.9  # of the body's radius: the widest neck that is one
 STANDS_ON = 0.75  # of the body's radius: how wide a bottle is at an eighth of its height; one that lies is 0.66
 CURVES = (1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0)  # of the shoulders tried, `BottleParameters.shoulder_curve`
 
@@ -42,12 +42,14 @@ class Profile:
         sections: for each direction, evenly about the axis from +x on, the surface in the plane through the axis: segments (segments, 2, 2) of (distance
             from the axis that way, height above the origin), metres.
         radii: the outermost surface by level, upwards, and direction, metres; NaN where there is none.
+        turned: from +x to the longer side, or to the nearest flat side of a square, radians; 0 where symmetry or shape tell of none.
     """
 
     origin: Float[np.ndarray, "3"]
     height: float
     sections: tuple[Float[np.ndarray, "_ 2 2"], ...]
     radii: Float[np.ndarray, "levels directions"]
+    turned: float
 
 
 def profile(mesh: "trimesh.Trimesh", category: str, fold: int, name: str) -> Profile:
@@ -60,19 +62,19 @@ def profile(mesh: "trimesh.Trimesh", category: str, fold: int, name: str) -> Pro
         name: of the mesh, for messages.
 
     Raises:
-        InputError: the mesh does not have this symmetry about z, or its front is elsewhere.
+        InputError: the mesh does not have this symmetry about z, or reaches out on another side than its front.
     """
-    low = mesh.vertices[np.unique(mesh.faces), 2].min()
-    axis = np.append(_axis(mesh, (0.0, 1.0) if fold != 1 else AXIS_FROM[category], name), low)
+    axis = np.append(_axis(mesh, AXIS_FROM[category] if fold == 1 else (0.0, 1.0), name), mesh.bounds[0, 2])
     sections = _sections(mesh, axis)
     # Of the highest point in each direction the median: the rim of a scan leans, and stray vertices must not raise it.
     tops = [section[(section[..., 0] > 0).any(axis=1), :, 1].max(initial=-np.inf) for section in sections]
     height = float(np.median([top for top in tops if top > -np.inf]))
     sections = tuple(section - [0.0, height / 2] for section in sections)
     radii = np.stack([_outermost(section, _levels(height)) for section in sections], axis=1)
-    found = Profile(axis + [0, 0, height / 2], height, sections, radii)
-    _check_symmetry(found, mesh.bounds - found.origin, fold, name)
-    return found
+    origin = axis + [0.0, 0.0, height / 2]
+    around = _outline(radii, name)
+    _check_symmetry(around, mesh.bounds - origin, fold, name)
+    return Profile(origin, height, sections, radii, _turned(around, fold))
 
 
 def profile_places(
@@ -151,32 +153,41 @@ def _outermost(section: np.ndarray, levels: np.ndarray) -> np.ndarray:
     return np.where(reach > 0, reach, np.nan)
 
 
-def _check_symmetry(found: Profile, bounds: np.ndarray, fold: int, name: str) -> None:
-    def refuse(what, expected):
-        raise InputError(f"profile(): {name} {what}; expected {expected}")
+def _outline(radii: np.ndarray, name: str) -> np.ndarray:
+    """Radii about the middle of the height, the median by direction; NaN where all is a hole."""
+    middle = radii[LEVELS // 4 : -LEVELS // 4].T
+    around = np.array([np.median(way[way > 0]) if (way > 0).any() else np.nan for way in middle])
+    if np.mean(around > 0) <= 0.5:
+        raise InputError(f"profile(): {name} has no surface about the middle of its height; expected one about its axis; repair the mesh, or correct its 'up'")
+    return around
 
+
+def _check_symmetry(around: np.ndarray, bounds: np.ndarray, fold: int, name: str) -> None:
     if fold == 1:
-        front, others = bounds[1, 0], max(-bounds[0, 0], bounds[1, 1], -bounds[0, 1])
-        if front < 0.9 * others:
-            refuse(f"reaches {100 * front:.1f} cm to its front and {100 * others:.1f} cm to another side", "a handle or longer side there; correct 'front'")
+        front, side = bounds[1, 0], max(-bounds[0, 0], bounds[1, 1], -bounds[0, 1])
+        if front < LEAST_FRONT * side:
+            raise InputError(
+                f"profile(): {name} reaches {100 * front:.1f} cm from its axis to its front and {100 * side:.1f} cm to another side; expected its handle "
+                "or longer side at the front; correct 'front' and 'up'"
+            )
         return
-    middle = found.radii[LEVELS // 4 : -LEVELS // 4]
-    around = np.array([np.median(way[way > 0]) if (way > 0).any() else np.nan for way in middle.T])  # NaN: a hole
-    mean = np.nanmean(around) if (around > 0).any() else np.nan
     for turn in TURNS[fold]:
-        change = float(np.nanquantile(np.abs(around - np.roll(around, round(turn * DIRECTIONS))), 0.9)) / mean
-        if not change < CHANGE:
-            refuse(f"is not {FOLDS[fold]}: a turn by {360 * turn:g} degrees about 'up' changes its outline by {100 * change:.0f} % of its radius",
-                   f"{100 * CHANGE:.0f} % at most; correct 'symmetry' or 'up'")
-    if fold == ROUND:
-        return
+        differences = np.abs(around - np.roll(around, round(turn * DIRECTIONS))) / np.nanmean(around)
+        change = float(np.nanquantile(differences, 0.9))  # holes and lugs aside
+        if change > CHANGE:
+            raise InputError(
+                f"profile(): {name} is not {FOLDS[fold]}: a turn of {360 * turn:g} degrees about 'up' changes its outline by {100 * change:.0f} % of its "
+                f"radius; expected {100 * CHANGE:.0f} % at most; correct 'symmetry' or 'up'"
+            )
+
+
+def _turned(around: np.ndarray, fold: int) -> float:
+    if fold in (ROUND, 1):
+        return 0.0
     angles = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
     harmonic = np.nansum(around**2 * np.exp(1j * fold * angles)) / np.nansum(around**2)
-    turned = np.degrees(np.angle(harmonic if fold == 2 else -harmonic)) / fold  # corners of a square lie beside its front
-    if abs(harmonic) > SHAPELESS and abs(turned) > OFF_FRONT:
-        c, s = np.cos(np.radians(turned)), np.sin(np.radians(turned))
-        refuse(f"has its {'longer side' if fold == 2 else 'flat side'} {turned:.0f} degrees from 'front', counter-clockwise about 'up'",
-               f"{OFF_FRONT:g} at most; give 'front' as a direction [x, y, z] of the file: {c:.4f} of the present front and {s:.4f} of that to its left")
+    # The second harmonic is largest along the longer side; the fourth along a square's corners, which lie beside its sides.
+    return float(np.angle(harmonic if fold == 2 else -harmonic)) / fold if abs(harmonic) > SHAPELESS else 0.0
 
 
 def _rim(found: Profile, fold: int, name: str) -> float:
@@ -206,7 +217,7 @@ def _bottle_levels(found: Profile, fold: int, name: str) -> tuple[float, float]:
         if neck > NARROWER * body or not below.any():
             raise _unmeasured(name, "nothing above its body is narrow enough for a neck; is 'up' right?", wanted)
         above = int(np.argmax(below))
-        neck = float(np.median(radius[above:]))  # so a cap counts by its length, wider or narrower
+        neck = float(np.quantile(radius[above:], .4))  # so a cap counts by its length, wider or narrower
     if radius[LEVELS // 8] < STANDS_ON * body:
         raise _unmeasured(name, f"it narrows from {200 * body:.1f} to {200 * radius[LEVELS // 8]:.1f} cm below; is 'up' right?", wanted)
     half_way = float(np.interp((body + neck) / 2, radius[[above, above - 1]], levels[[above, above - 1]]))
@@ -215,12 +226,16 @@ def _bottle_levels(found: Profile, fold: int, name: str) -> tuple[float, float]:
 
 
 def _mean_radius(found: Profile, fold: int) -> np.ndarray:
-    """By level: the median over directions, over the back ones of an object with a handle."""
-    radii = found.radii[:, DIRECTIONS // 4 : 3 * DIRECTIONS // 4 + 1] if fold == 1 else found.radii
-    seen = (radii > 0).any(axis=1)
-    if seen.mean() < 0.5:
-        return np.zeros(LEVELS)
-    return np.interp(np.arange(LEVELS), np.flatnonzero(seen), np.nanmedian(radii[seen], axis=1))
+    """Half the width by level, the median over directions; over those across the front of an object with a handle."""
+    filled = found.radii.copy()
+    for way in filled.T:
+        seen = way > 0
+        if seen.any():  # a hole is as wide as what is above and below it
+            way[:] = np.interp(np.arange(LEVELS), np.flatnonzero(seen), way[seen])
+    widths = filled[:, : DIRECTIONS // 2] + filled[:, DIRECTIONS // 2 :]  # both ways, as a scan may lean
+    if fold == 1:
+        widths = widths[:, DIRECTIONS // 16 : 7 * DIRECTIONS // 16 + 1]
+    return np.nanmedian(widths, axis=1) / 2
 
 
 def _shoulder_from(levels: np.ndarray, radius: np.ndarray, half_way: float, neck: float, height: float) -> float:

@@ -13,6 +13,7 @@ from tdf_jax.viz.style import LIGHT, STYLE, blank_figure
 if TYPE_CHECKING:
     import trimesh
 
+
 def contact_sheet(objects: "Sequence[tuple[str, trimesh.Trimesh]]", columns: int = 8) -> Figure:
     """Meshes in rows, all at one scale, seen from above and one side.
 
@@ -23,15 +24,14 @@ def contact_sheet(objects: "Sequence[tuple[str, trimesh.Trimesh]]", columns: int
     half = max(float(np.max(mesh.extents)) for _, mesh in objects) / 2
     lines = -(-len(objects) // columns)
     with matplotlib.rc_context(STYLE):
-        figure = blank_figure(1.5 * columns, 1.6 * lines)
+        figure = blank_figure(1.2 * columns, 1.4 * lines)
         for number, (title, mesh) in enumerate(objects):
             axes = figure.add_subplot(lines, columns, number + 1, projection="3d")
-            middle = mesh.bounds.mean(axis=0)
-            axes.add_collection3d(surface(np.asarray(mesh.triangles) - middle, LIGHT).collection())
+            axes.add_collection3d(surface(np.asarray(mesh.triangles) - mesh.bounds.mean(axis=0), LIGHT).collection())
             axes.set(xlim=(-half, half), ylim=(-half, half), zlim=(-half, half))
-            axes.set_box_aspect((1, 1, 1), zoom=1.7)
+            axes.set_box_aspect((1, 1, 1), zoom=1.45)
             axes.view_init(elev=25, azim=-60)
             axes.set_axis_off()
-            axes.set_title(title, y=0.95, fontsize=7)
-        figure.subplots_adjust(left=0, right=1, bottom=0, top=0.96, wspace=0, hspace=0.05)
+            axes.set_title(title, y=-0.12, fontsize=6.5)
+        figure.subplots_adjust(left=0, right=1, bottom=0.03, top=1, wspace=0, hspace=0.12)
     return figure

@@ -1,0 +1,45 @@
+"""`tdf shapes`: what generated objects look like, beside meshes of real ones."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+def shapes(
+    category: Literal["mug", "bowl", "bottle"],
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")],
+    count: int = 24,
+    seed: int = 0,
+    meshes: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="(default: none)")] = None,
+) -> None:
+    """Draw a contact sheet of generated objects, each with its symmetry.
+
+    Args:
+        category: of the objects.
+        out: .png to write.
+        count: of generated objects.
+        seed: of their dimensions; training and evaluation draw others.
+        meshes: folder of real objects and their meshes.json, drawn after them; see docs/evaluation.md.
+    """
+    import numpy as np
+
+    from tdf_jax.errors import InputError
+    from tdf_jax.evaluation.annotated import load_annotated
+    from tdf_jax.shapes import FAMILIES
+    from tdf_jax.symmetry import FOLDS
+    from tdf_jax.viz.sheet import contact_sheet
+    from tdf_jax.viz.style import save_figure
+
+    if count < 1:
+        raise InputError(f"tdf shapes: --count is {count}; expected at least 1")
+    if not 0 <= seed < 2**32:
+        raise InputError(f"tdf shapes: --seed is {seed}; expected 0 to {2**32 - 1}")
+    if out.suffix != ".png" or not out.parent.is_dir():
+        raise InputError(f"tdf shapes: --out is {out}; expected a .png in an existing folder")
+    family = FAMILIES[category]
+    real = [] if meshes is None else [one for one in load_annotated(meshes) if one.category == category]
+    generated = [family.build(family.sample(np.random.default_rng([seed, index]))) for index in range(count)]
+    named = [(FOLDS[one.fold], one.mesh) for one in generated] + [(f"{one.name}: {FOLDS[one.fold]}", one.mesh) for one in real]
+    save_figure(out, contact_sheet(named))
+    print(f"saved {out}")
