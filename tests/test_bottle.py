@@ -307,6 +307,8 @@ def test_bad_dimensions_are_refused_by_name(change, message):
     ({"handle_thickness": 0.0245, "handle_reach": 0.018}, "the handle bends more tightly than its thickness allows"),
     ({"handle_bottom": 0.014}, "handle_bottom is below the body: raise it"),
     ({"handle_reach": 0.008, "handle_thickness": 0.008}, "the handle leaves no finger hole: raise handle_reach"),
+    # A cap as wide as the handle reaches fills its hole.
+    ({"handle_top": 0.2, "handle_bottom": 0.165, "cap_radius": 0.06, "cap_height": 0.0489}, "the dimensions give no single closed bottle"),
 ])
 def test_bad_handles_are_refused_by_name(change, message):
     with pytest.raises(InputError, match=r"build_bottle\(\)") as error:

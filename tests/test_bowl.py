@@ -26,7 +26,7 @@ VARIANTS = {
 
 def clay_along(bowl, level, direction=(1.0, 0.0)):
     """Distances from the axis, 5e-6 m apart, that are clay at a level above the base."""
-    reach = np.arange(0, 0.15, 5e-6)
+    reach = np.arange(0, 0.1, 5e-6)
     flat = reach[:, None] * np.array(direction) / np.linalg.norm(direction)
     return reach[bowl.contains(np.column_stack([flat, np.full(len(reach), level - bowl.height / 2)]))]
 
@@ -36,7 +36,7 @@ def outer(bowl, levels, direction=(1.0, 0.0)):
     return np.array([clay_along(bowl, level, direction)[-1] for level in levels])
 
 
-def below_the_rim(p, count=7):
+def below_the_rim(p, count=5):
     """Levels of the side between the floor and the rounding of the rim."""
     return np.linspace(p.foot_height + p.bottom_thickness, 0.92 * p.height, count)
 

@@ -66,6 +66,12 @@ def assert_one_closed_cup(mesh):
 # ---- every family ----
 
 
+def test_a_demonstration_picks_a_mug_at_its_handle_a_bowl_at_its_rim_and_a_bottle_at_its_neck():
+    """The order is that of the places in data sets, too."""
+    places = {category: family.places for category, family in FAMILIES.items()}
+    assert places == {"mug": ("handle", "rim", "base"), "bowl": ("rim", "base", "body"), "bottle": ("neck", "base", "body")}
+
+
 @pytest.mark.parametrize("category", FAMILIES)
 def test_a_family_builds_its_category_with_its_places_in_a_frame_that_stands_upright(category):
     family = FAMILIES[category]

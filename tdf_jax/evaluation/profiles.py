@@ -28,8 +28,8 @@ CHANGE = 0.15  # of the radius: by how much a turn may change it still
 LEAST_FRONT = 0.9  # of the reach to the other sides: less of a reach is not to the front
 SHAPELESS = 0.02  # strength of an outline's harmonic below which it has no direction: an ellipse 4 % longer than wide
 NARROWER = 0.9  # of the body's radius: the widest neck that is one
-STANDS_ON = 0.75  # of the body's radius: how wide a bottle is at an eighth of its height; one that lies is 0.66
-CURVES = (1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0)  # of the shoulders tried, `BottleParameters.shoulder_curve`
+CURVES = np.linspace(1.0, 3.0, 17)  # of the shoulders tried, `BottleParameters.shoulder_curve`
+LOWEST_SHOULDER = 0.5  # of the height of the shoulder's middle: where it may begin; lower, barrels are taken for shoulders
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Profile:
         height: metres.
         sections: for each direction, evenly about the axis from +x on, the surface in the plane through the axis: segments (segments, 2, 2) of (distance
             from the axis that way, height above the origin), metres.
-        radii: the outermost surface by level, upwards, and direction, metres; NaN where there is none.
+        radii: the outermost surface by level, upwards, and direction, metres; a hole is as wide as what is above and below it, NaN if it is all of the height.
         turned: from +x to the longer side, or to the nearest flat side of a square, radians; 0 where symmetry or shape tell of none.
     """
 
@@ -71,8 +71,10 @@ def profile(mesh: "trimesh.Trimesh", category: str, fold: int, name: str) -> Pro
     height = float(np.median([top for top in tops if top > -np.inf]))
     sections = tuple(section - [0.0, height / 2] for section in sections)
     radii = np.stack([_outermost(section, _levels(height)) for section in sections], axis=1)
+    if np.isfinite(radii[0]).sum() <= DIRECTIONS / 2:
+        raise InputError(f"profile(): {name} has no surface on most sides of its middle; expected one about its axis; repair the mesh, or correct its 'up'")
     origin = axis + [0.0, 0.0, height / 2]
-    around = _outline(radii, name)
+    around = _outline(radii)
     _check_symmetry(around, mesh.bounds - origin, fold, name)
     return Profile(origin, height, sections, radii, _turned(around, fold))
 
@@ -143,23 +145,21 @@ def _sections(mesh, axis: np.ndarray) -> list[np.ndarray]:
 
 
 def _outermost(section: np.ndarray, levels: np.ndarray) -> np.ndarray:
-    """The greatest first coordinate at each level of the second, NaN where none is positive; as `crossings`, at once."""
+    """The greatest first coordinate at each level of the second, from its neighbours where none is positive; NaN if none is at any."""
     first, last = (np.searchsorted(levels, end) for end in (section[..., 1].min(axis=1), section[..., 1].max(axis=1)))
     segment = np.repeat(np.arange(len(section)), last - first)
     level = np.arange(len(segment)) - np.repeat(np.cumsum(last - first) - last, last - first)
     a, b = section[segment, 0], section[segment, 1]
-    reach = np.full(len(levels), -np.inf)
+    reach = np.zeros(len(levels))
     np.maximum.at(reach, level, a[:, 0] + (levels[level] - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0]))
-    return np.where(reach > 0, reach, np.nan)
+    seen = reach > 0
+    return np.interp(levels, levels[seen], reach[seen]) if seen.any() else np.full(len(levels), np.nan)
 
 
-def _outline(radii: np.ndarray, name: str) -> np.ndarray:
-    """Radii about the middle of the height, the median by direction; NaN where all is a hole."""
-    middle = radii[LEVELS // 4 : -LEVELS // 4].T
-    around = np.array([np.median(way[way > 0]) if (way > 0).any() else np.nan for way in middle])
-    if np.mean(around > 0) <= 0.5:
-        raise InputError(f"profile(): {name} has no surface about the middle of its height; expected one about its axis; repair the mesh, or correct its 'up'")
-    return around
+def _outline(radii: np.ndarray) -> np.ndarray:
+    """Radii by direction of sections of the body, as shares of the median one."""
+    body = radii[LEVELS // 8 : LEVELS // 2]
+    return np.median(body / np.nanmedian(body, axis=1, keepdims=True), axis=0)
 
 
 def _check_symmetry(around: np.ndarray, bounds: np.ndarray, fold: int, name: str) -> None:
@@ -172,8 +172,7 @@ def _check_symmetry(around: np.ndarray, bounds: np.ndarray, fold: int, name: str
             )
         return
     for turn in TURNS[fold]:
-        differences = np.abs(around - np.roll(around, round(turn * DIRECTIONS))) / np.nanmean(around)
-        change = float(np.nanquantile(differences, 0.9))  # holes and lugs aside
+        change = float(np.nanquantile(np.abs(around - np.roll(around, round(turn * DIRECTIONS))), 0.9))  # lugs aside
         if change > CHANGE:
             raise InputError(
                 f"profile(): {name} is not {FOLDS[fold]}: a turn of {360 * turn:g} degrees about 'up' changes its outline by {100 * change:.0f} % of its "
@@ -207,35 +206,33 @@ def _rim(found: Profile, fold: int, name: str) -> float:
 
 def _bottle_levels(found: Profile, fold: int, name: str) -> tuple[float, float]:
     """Heights of the neck's and the body's places."""
-    radius, height = _mean_radius(found, fold), found.height
+    radius, height, wanted = _mean_radius(found, fold), found.height, "a bottle with a neck above its body"
+    width = float(np.nanmax(_widths(found)))
+    if width > height:  # of one that lies, a handle would be the neck
+        raise _unmeasured(name, f"it is {100 * width:.1f} cm wide and {100 * height:.1f} cm high; is 'up' right?", wanted)
     levels = _levels(height) + height / 2
-    wanted = "a bottle with a neck above its body"
     body = float(np.quantile(radius[: LEVELS // 2], 0.9))  # not the greatest: a seam; not the median: a waist
     neck = float(np.quantile(radius[LEVELS // 2 :], 0.2))
     for _ in range(4):  # the neck is what is above the shoulder's middle, which is half way between body and neck; settles after two
-        below = (radius < (body + neck) / 2) & (np.arange(LEVELS) >= LEVELS // 4)
+        below = (radius < (body + neck) / 2) & (np.arange(LEVELS) >= LEVELS // 3)
         if neck > NARROWER * body or not below.any():
             raise _unmeasured(name, "nothing above its body is narrow enough for a neck; is 'up' right?", wanted)
         above = int(np.argmax(below))
-        neck = float(np.quantile(radius[above:], .4))  # so a cap counts by its length, wider or narrower
-    if radius[LEVELS // 8] < STANDS_ON * body:
-        raise _unmeasured(name, f"it narrows from {200 * body:.1f} to {200 * radius[LEVELS // 8]:.1f} cm below; is 'up' right?", wanted)
+        neck = float(np.quantile(radius[above:], 0.3))  # most caps are wider than their neck
     half_way = float(np.interp((body + neck) / 2, radius[[above, above - 1]], levels[[above, above - 1]]))
     body_to = _shoulder_from(levels[LEVELS // 8 : above], radius[LEVELS // 8 : above], half_way, neck, height)
     return half_way / 2, (body_to - height) / 2
 
 
+def _widths(found: Profile) -> np.ndarray:
+    """By level and direction, both ways: what a leaning scan has more on one side it has less on the other."""
+    return found.radii[:, : DIRECTIONS // 2] + found.radii[:, DIRECTIONS // 2 :]
+
+
 def _mean_radius(found: Profile, fold: int) -> np.ndarray:
-    """Half the width by level, the median over directions; over those across the front of an object with a handle."""
-    filled = found.radii.copy()
-    for way in filled.T:
-        seen = way > 0
-        if seen.any():  # a hole is as wide as what is above and below it
-            way[:] = np.interp(np.arange(LEVELS), np.flatnonzero(seen), way[seen])
-    widths = filled[:, : DIRECTIONS // 2] + filled[:, DIRECTIONS // 2 :]  # both ways, as a scan may lean
-    if fold == 1:
-        widths = widths[:, DIRECTIONS // 16 : 7 * DIRECTIONS // 16 + 1]
-    return np.nanmedian(widths, axis=1) / 2
+    """Half the width by level, the median over directions, of an object with a handle over those beside it."""
+    beside = slice(DIRECTIONS // 16, 7 * DIRECTIONS // 16 + 1) if fold == 1 else slice(None)
+    return np.nanmedian(_widths(found)[:, beside], axis=1) / 2
 
 
 def _shoulder_from(levels: np.ndarray, radius: np.ndarray, half_way: float, neck: float, height: float) -> float:
@@ -245,19 +242,21 @@ def _shoulder_from(levels: np.ndarray, radius: np.ndarray, half_way: float, neck
     with 95 % of the body's radius was tried: it is in the middle of a dome, up to 46 mm too high on a bottle of 0.3 m.
     """
     best, level = np.inf, half_way
-    shoulders = [(curve, (1 - 0.5**curve) ** (1 / curve)) for curve in CURVES] + [(None, 0.5)]  # None: a slope; with the share of it at half_way
-    for start in np.arange(0.3 * half_way, half_way, 0.005 * height):
-        share = np.maximum(levels - start, 0) / (half_way - start)
-        s = np.minimum(levels / start, 1)
-        for curve, middle in shoulders:
-            if start + (half_way - start) / middle > height:
-                continue
-            wide = (1 + np.cos(np.pi * middle * share)) / 2 if curve is None else np.maximum(1 - (middle * share) ** curve, 0) ** (1 / curve)
-            parts = np.stack([wide, 4 * s * (1 - s)], axis=1)  # the body's radius and its bulge
-            rest = radius - neck * (1 - wide)
-            off = np.abs(parts @ np.linalg.lstsq(parts, rest, rcond=None)[0] - rest).sum()  # not squared: seams and labels
-            if off < best:
-                best, level = off, start
+    start = np.arange(LOWEST_SHOULDER * half_way, half_way, 0.0025 * height)[:, None]
+    bulge = 4 * np.minimum(levels / start, 1) * (1 - np.minimum(levels / start, 1))
+    shoulders = [(curve, (1 - 0.5**curve) ** (1 / curve)) for curve in CURVES] + [(None, 0.5)]  # None: a slope; with its share below half_way
+    for curve, middle in shoulders:
+        share = middle * np.maximum(levels - start, 0) / (half_way - start)
+        wide = (1 + np.cos(np.pi * share)) / 2 if curve is None else np.maximum(1 - share**curve, 0) ** (1 / curve)
+        rest = radius - neck * (1 - wide)
+        # Least squares for the body's radius, which `wide` scales, and its bulge.
+        ww, wb, bb, wr, br = (np.sum(one * other, axis=1, keepdims=True) for one, other in
+                              ((wide, wide), (wide, bulge), (bulge, bulge), (wide, rest), (bulge, rest)))
+        body, out = np.array([bb * wr - wb * br, ww * br - wb * wr]) / (ww * bb - wb**2)
+        off = np.abs(rest - body * wide - out * bulge).sum(axis=1)  # not squared: seams and labels
+        off[(start + (half_way - start) / middle > height)[:, 0]] = np.inf  # its neck would begin above the top
+        if off.min() < best:
+            best, level = off.min(), start[off.argmin(), 0]
     return float(level)
 
 
