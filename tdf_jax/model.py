@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from tdf_jax import pointcloud
 from tdf_jax.errors import InputError
@@ -20,6 +20,7 @@ from tdf_jax.pointcloud import check_points
 CENTRED = 1e-7  # of a cloud's extent: a mean this near zero is float32's rounding
 ROOM = 250  # clouds that are not thinned are filled up to a multiple, which common sizes are already
 THINNINGS = 8  # 16 gain another 0.003 of IoU
+SAME_SIDE = np.pi / 6  # radians; latents of one mug's thinnings are turned against each other by 1 to 2 degrees, those of symmetric objects by 60 to 90 on average
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,12 +129,18 @@ def _encode(params, config, clouds, several, size):
     """The field of the first `several` clouds, averaged, of each of which the first `size` points count; the others are repetitions."""
     used = jnp.arange(clouds.shape[1]) < size
 
+    def fill(index, state):
+        return jax.tree.map(lambda all, one: all.at[index].set(one), state, _latent(params, config, clouds[index], used))
+
     def add(index, sums):
-        return jax.tree.map(jnp.add, sums, _latent(params, config, clouds[index], used))
+        return jax.tree.map(lambda sum, all: sum + jnp.where(agreed[index], all[index], 0), sums, (latents, origins))
 
     dtype = jnp.result_type(clouds, *jax.tree.leaves(params))
-    sums = jnp.zeros((config.latent, 3), dtype), jnp.zeros(3, clouds.dtype)
-    latent, origin = (part / several for part in jax.lax.fori_loop(0, several, add, sums))
+    blank = jnp.zeros((len(clouds), config.latent, 3), dtype), jnp.zeros((len(clouds), 3), clouds.dtype)
+    latents, origins = jax.lax.fori_loop(0, several, fill, blank)
+    agreed = agreeing(latents, jnp.arange(len(clouds)) < several)
+    sums = jax.lax.fori_loop(0, several, add, jax.tree.map(lambda all: jnp.zeros_like(all[0]), blank))
+    latent, origin = (part / jnp.sum(agreed) for part in sums)
     return DescriptorField(condition(params, config, latent), origin)
 
 
@@ -141,7 +148,37 @@ def _encode(params, config, clouds, several, size):
 def _average(params, config, clouds):
     """The same of all points of all clouds, without a loop of unknown length, which has no reverse-mode derivative."""
     latents, origins = jax.lax.map(lambda points: _latent(params, config, points), clouds)
-    return DescriptorField(condition(params, config, jnp.mean(latents, axis=0)), jnp.mean(origins, axis=0))
+    agreed = agreeing(jax.lax.stop_gradient(latents), jnp.ones(len(clouds), bool))
+    latent, origin = (jnp.mean(all, axis=0, where=agreed[:, *[None] * (all.ndim - 1)]) for all in (latents, origins))
+    return DescriptorField(condition(params, config, latent), origin)
+
+
+def agreeing(latents: Float[Array, "thinnings latent 3"], used: Bool[Array, "thinnings"]) -> Bool[Array, "thinnings"]:
+    """Which latents of one object show it in the same of several poses that it cannot be told apart in.
+
+    Thinned this way or that, a symmetric object looks a little more like one of the poses its symmetry makes equal or like another, and the network decides for one of them: a flat
+    bottle's two sides change places, a round one is turned about its axis. The mean of such latents is the latent of none of them: of round bottles it had an IoU of 0.87, each alone 0.93. Two latents agree
+    if a rotation would bring them no nearer than to half of their squared distance, or turns by less than `SAME_SIDE`; those that agree with the one that most others agree with are kept, of an object without
+    symmetry all.
+
+    Args:
+        latents: of thinnings of one cloud.
+        used: those that count.
+
+    Source:
+        The best rotation is Kabsch's, Acta Crystallographica A, 1976.
+    """
+    cross = jnp.einsum("aci,bcj->abij", latents, latents, precision=jax.lax.Precision.HIGHEST)
+    u, values, v = jnp.linalg.svd(cross)
+    sign = jnp.linalg.det(u) * jnp.linalg.det(v)
+    proper = jnp.stack([jnp.ones_like(sign), jnp.ones_like(sign), sign], axis=-1)
+    squares = jnp.sum(latents**2, axis=(1, 2))
+    total = squares[:, None] + squares
+    apart = total - 2 * jnp.trace(cross, axis1=-2, axis2=-1)
+    aligned = total - 2 * jnp.sum(proper * values, axis=-1)
+    cosine = (jnp.einsum("abik,abk,abki->ab", u, proper, v) - 1) / 2
+    agree = ((apart <= 2 * aligned) | (cosine >= jnp.cos(SAME_SIDE))) & used & used[:, None]
+    return agree[jnp.argmax(jnp.sum(agree, axis=1))]
 
 
 def _latent(params, config, points, used=None):

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
 from tdf_jax.errors import InputError
+from tdf_jax.model import agreeing
 from tdf_jax.network import encode_latent
 from tdf_jax.pointcloud import thinnings
 
@@ -133,9 +134,38 @@ def test_a_dense_cloud_is_thinned_several_times_and_the_latents_averaged(small_m
     fields = [tdf.encode(small_model, cloud) for cloud in clouds]
     latents = np.stack([field.latent for field in fields])
     assert np.abs(latents - latents[0]).max() > 1e-2 * np.abs(latents).max()
+    agreed = np.asarray(agreeing(jnp.asarray(latents), np.ones(4, bool)))
+    assert agreed.any()
     found = tdf.encode(thinning_model, points, thinnings=4)
-    np.testing.assert_allclose(found.latent, latents.mean(axis=0), atol=1e-6)
-    np.testing.assert_allclose(found.origin, np.mean([field.origin for field in fields], axis=0), atol=1e-7)
+    np.testing.assert_allclose(found.latent, latents[agreed].mean(axis=0), atol=1e-6)
+    np.testing.assert_allclose(found.origin, np.mean([field.origin for field in fields], axis=0, where=agreed[:, None]), atol=1e-7)
+
+
+def noisy(latent, turns, seed):
+    """A latent turned about z by degrees, with noise of a tenth."""
+    noise = np.random.default_rng(seed).normal(size=(len(turns), *latent.shape)) * 0.1 * np.std(latent)
+    return jnp.asarray(latent @ Rotation.from_euler("z", turns[:, None], degrees=True).as_matrix().transpose(0, 2, 1) + noise, jnp.float32)
+
+
+@pytest.mark.parametrize(("turns", "kept"), [
+    ([0.0] * 8, "11111111"),
+    ([0, 3, -4, 2, 5, 0, -3, 1], "11111111"),  # of an object without symmetry: they differ by how well its frame is found
+    ([0, 180, 180, 0, 180, 180, 0, 180], "01101101"),  # a flat bottle's two sides: those that are more
+    ([0, 90, 180, 270, 0, 90, 0, 180], "10001010"),
+    ([200, 0], "10"),  # of as many, the first
+])  # fmt: skip
+def test_only_latents_that_show_one_of_the_poses_of_a_symmetric_object_are_averaged(turns, kept):
+    latents = noisy(random_cloud(0, 40), np.array(turns, float), seed=1)
+    np.testing.assert_array_equal(agreeing(latents, np.ones(len(turns), bool)), [one == "1" for one in kept])
+    # What only fills up the room never counts, be it alike.
+    filled, used = jnp.concatenate([latents, latents[1:2], latents[1:2]]), np.arange(len(turns) + 2) < len(turns)
+    np.testing.assert_array_equal(agreeing(filled, used), [one == "1" for one in kept + "00"])
+
+
+def test_latents_that_are_only_noisy_agree():
+    """Noise as large as the latent: no rotation brings two of them much nearer."""
+    latents = random_cloud(0, 40) + np.random.default_rng(2).normal(size=(8, 40, 3)) * np.std(random_cloud(0, 40))
+    assert np.asarray(agreeing(jnp.asarray(latents, jnp.float32), np.ones(8, bool))).all()
 
 
 def test_the_average_turns_with_the_cloud(thinning_model):
