@@ -177,8 +177,7 @@ def test_partners_are_of_the_same_source_and_symmetry(objects, monkeypatch):
         assert (folds[first], sources[first]) == (folds[partner], sources[partner])
     met = {tuple(pair) for pair in found.tolist()}
     assert met == {(a, b) for kind in ((0, 2), (1, 3), (4, 7), (5, 6)) for a in kind for b in kind}
-    # Only an object without any symmetry has a front.
-    np.testing.assert_array_equal(made.sided, (np.array(folds)[found] == 1).astype(np.float32))
+    np.testing.assert_array_equal(made.fold, np.array(folds)[found])
 
 
 @pytest.fixture
@@ -249,14 +248,14 @@ def test_of_objects_without_symmetry_turned_poses_and_close_ones_are_wrong(objec
     monkeypatch.setattr(batch, "_wrong", turned)
     made = drawn(many(objects, [1] * 3, [0] * 3), 1, pairs=2, poses=5)
     assert len(asked) == 2 * 2 * 4  # none was drawn again
-    assert (made.sided == 1).all()
+    assert (made.fold == 1).all()
 
 
-def test_validation_pairs_are_of_one_kind_and_tell_which_objects_have_a_front(objects):
+def test_validation_pairs_are_of_one_kind_and_tell_their_symmetry(objects):
     data = many(objects, [0, 1, 0, 1, 2, 1], [0, 0, 0, 0, 0, 1])
     pairs = validation_pairs(data, 100, 12, 6, one_view=False)
     assert len(pairs) == 2  # the two-fold one and the one of another source have no partner
     for pair, (a, b) in zip(pairs, ((0, 2), (1, 3)), strict=True):
         np.testing.assert_array_equal(pair.inside, data.inside[[a, b], :500])
-        np.testing.assert_array_equal(pair.sided, data.fold[[a, b]] == 1)
-        assert pair.sided.dtype == np.float32 and pair.sided.shape == (2,)
+        np.testing.assert_array_equal(pair.fold, data.fold[[a, b]])
+        assert pair.fold.dtype == np.float32 and pair.fold.shape == (2,)

@@ -140,9 +140,10 @@ def test_a_cap_steps_out_from_the_neck_and_tapers_to_its_bevel(taper):
     assert on_axis(bottle, [0.15, 0.199, 0.201, 0.2199]).all()  # solid, whatever the depth of the mouth would be
 
 
-@pytest.mark.xfail(strict=True, reason="a cap lower than the step it makes turns the outline back down")
-def test_a_low_cap_is_a_cap():
-    p = BottleParameters(cap_height=2e-5)
+def test_a_cap_is_no_film():
+    with pytest.raises(InputError, match="cap_height must be 0 or more than 0.005 of height"):
+        build_bottle(BottleParameters(cap_height=2e-5))
+    p = BottleParameters(cap_height=1.2e-3)
     np.testing.assert_allclose(build_bottle(p).mesh.bounds[1, 2], p.height / 2, atol=1e-6)
 
 
@@ -308,7 +309,7 @@ def test_bad_dimensions_are_refused_by_name(change, message):
     ({"handle_bottom": 0.014}, "handle_bottom is below the body: raise it"),
     ({"handle_reach": 0.008, "handle_thickness": 0.008}, "the handle leaves no finger hole: raise handle_reach"),
     # A cap as wide as the handle reaches fills its hole.
-    ({"handle_top": 0.2, "handle_bottom": 0.165, "cap_radius": 0.06, "cap_height": 0.0489}, "the dimensions give no single closed bottle"),
+    ({"handle_top": 0.203, "handle_bottom": 0.168, "cap_radius": 0.06, "cap_height": 0.0489}, "the dimensions give no single closed bottle"),
 ])
 def test_bad_handles_are_refused_by_name(change, message):
     with pytest.raises(InputError, match=r"build_bottle\(\)") as error:

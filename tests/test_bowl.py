@@ -80,7 +80,6 @@ def test_the_wall_is_as_thick_as_asked_across_it(name):
         np.testing.assert_array_equal(bowl.contains(surface + share * p.wall_thickness * inward), clay, err_msg=f"{share}")
 
 
-@pytest.mark.xfail(strict=True, reason="the offset of a drawn-in side ends below the rim; above its end the hollow keeps its radius")
 def test_a_drawn_in_rim_has_the_walls_thickness_and_a_top():
     p = BowlParameters(rim_flare=-0.006, lip_radius=0.0018)
     bowl = build_bowl(p)

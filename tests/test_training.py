@@ -15,7 +15,7 @@ from tdf_jax.optimize import OptimizeConfig
 from tdf_jax.training import dataset, loop, record
 from tdf_jax.training.config import TrainConfig
 from tdf_jax.training.dataset import Recipe, joined
-from tdf_jax.training.objective import FRAME_AXES, frame_error
+from tdf_jax.training.objective import FRONT, UP, frame_error
 from tdf_jax.viz.curves import training_figure
 
 NETWORK = NetworkConfig(latent=16, vector_hidden=16, vector_width=32, decoder_width=16, blocks=1)
@@ -267,57 +267,68 @@ def test_transfers_of_validation_objects_have_their_truth(sets):
 # ---- symmetric objects ----
 
 
-@pytest.mark.parametrize("sided", [0.0, 1.0])
-def test_the_frames_error_asks_for_up_and_origin_and_for_a_front_where_there_is_one(sided):
-    rng = np.random.default_rng(0)
-    params = {"frame": jnp.asarray(rng.normal(size=(16, 3)))}
-    latent, centre = jnp.asarray(rng.normal(size=(16, 3))), jnp.asarray(rng.normal(size=3))
-    up, front, origin = np.asarray(params["frame"]).T @ np.asarray(latent)
-    expected = np.sum((up - [0, 0, 1]) ** 2) + sided * np.sum((front - [1, 0, 0]) ** 2) + np.sum((origin - np.asarray(centre)) ** 2)
-    found, gradient = jax.value_and_grad(frame_error)(params, latent, centre, jnp.asarray(sided))
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
-    asked = np.abs(gradient["frame"]).max(axis=0) > 0
-    np.testing.assert_array_equal(asked, [True, sided == 1, True])
+TURNS = {0: (), 1: (0,), 2: (0, 180), 4: (0, 90, 180, 270)}  # degrees between the fronts of an object of each symmetry
+
+
+@pytest.mark.parametrize("fold", TURNS)
+def test_the_frames_error_asks_for_up_and_origin_and_for_the_nearest_front(fold):
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        params = {"frame": jnp.asarray(rng.normal(size=(16, 3)))}
+        latent, centre = jnp.asarray(rng.normal(size=(16, 3))), jnp.asarray(rng.normal(size=3))
+        up, front, origin = np.asarray(params["frame"]).T @ np.asarray(latent)
+        fronts = [[np.cos(np.radians(turn)), np.sin(np.radians(turn)), 0] for turn in TURNS[fold]]
+        expected = np.sum((up - [0, 0, 1]) ** 2) + np.sum((origin - np.asarray(centre)) ** 2)
+        expected += min((np.sum((front - one) ** 2) for one in fronts), default=0)
+        found, gradient = jax.value_and_grad(frame_error)(params, latent, centre, jnp.asarray(float(fold)))
+        np.testing.assert_allclose(found, expected, rtol=1e-5)
+        asked = np.abs(gradient["frame"]).max(axis=0) > 0
+        np.testing.assert_array_equal(asked, [True, fold != 0, True])
 
 
 def test_the_loss_of_a_pair_asks_each_object_for_its_own_front(whole, sets):
     params = {"network": whole[1], "frame": jnp.asarray(np.random.default_rng(0).normal(size=(16, 3)), jnp.float32)}
     (pair,) = loop.validation_pairs(sets[1], CONFIG.points, loop.VALIDATION_BOX, loop.VALIDATION_POSES, False)
-    np.testing.assert_array_equal(pair.sided, [1, 1])
+    np.testing.assert_array_equal(pair.fold, [1, 1])
     parts = {}
-    for sided in ((1, 1), (1, 0), (0, 1)):
-        samples = dataclasses.astuple(dataclasses.replace(pair, sided=np.array(sided, np.float32)))
-        parts[sided] = jax.tree.map(np.asarray, loop._evaluate(params, NETWORK, samples))
-    for sided, other in (((1, 0), 1), ((0, 1), 0)):
-        assert parts[sided]["frame"][other] < parts[1, 1]["frame"][other] - 0.1
-        assert parts[sided]["frame"][1 - other] == parts[1, 1]["frame"][1 - other]
-        assert parts[sided]["loss"] < parts[1, 1]["loss"]
+    for fold in ((1, 1), (1, 0), (0, 1)):
+        samples = dataclasses.astuple(dataclasses.replace(pair, fold=np.array(fold, np.float32)))
+        parts[fold] = jax.tree.map(np.asarray, loop._evaluate(params, NETWORK, samples))
+    for fold, other in (((1, 0), 1), ((0, 1), 0)):
+        assert parts[fold]["frame"][other] < parts[1, 1]["frame"][other] - 0.1
+        assert parts[fold]["frame"][1 - other] == parts[1, 1]["frame"][1 - other]
+        assert parts[fold]["loss"] < parts[1, 1]["loss"]
         for name in ("bce", "place", "intersection", "union"):
-            np.testing.assert_array_equal(parts[sided][name], parts[1, 1][name])
+            np.testing.assert_array_equal(parts[fold][name], parts[1, 1][name])
 
 
 def test_the_front_is_read_out_of_the_objects_that_have_one():
     rng = np.random.default_rng(0)
     latents, centres = rng.normal(size=(5, 16, 3)), rng.normal(size=(5, 3))
-    truths = [(*FRAME_AXES, centre) for centre in centres]
-    fitted = np.asarray(loop._read_outs(latents, centres, np.ones(5, np.float32)))
+    truths = [(UP, FRONT, centre) for centre in centres]
+    fitted = np.asarray(loop._read_outs(latents, centres, np.ones(5, np.float32), 0))
     for latent, truth in zip(latents, truths, strict=True):  # 15 equations for 16 unknowns
         np.testing.assert_allclose(fitted.T @ latent, truth, atol=1e-4)
-    sided = np.array([1, 0, 1, 0, 0], np.float32)
-    some = np.asarray(loop._read_outs(latents, centres, sided))
+    fold = np.array([1, 0, 1, 2, 4], np.float32)
+    some = np.asarray(loop._read_outs(latents, centres, fold, 0))
     np.testing.assert_allclose(some[:, [0, 2]], fitted[:, [0, 2]], atol=1e-6)
-    for latent in latents[sided > 0]:
+    for latent in latents[fold == 1]:
         np.testing.assert_allclose(some[:, 1] @ latent, [1, 0, 0], atol=1e-5)
-    np.testing.assert_allclose(some[:, 1], np.asarray(loop._read_outs(latents[sided > 0], centres[:2], np.ones(2)))[:, 1], atol=1e-6)
+    np.testing.assert_allclose(some[:, 1], np.asarray(loop._read_outs(latents[fold == 1], centres[:2], np.ones(2), 0))[:, 1], atol=1e-6)
 
 
-def test_without_a_front_anywhere_its_read_out_is_zero():
+def test_without_an_object_of_one_front_its_read_out_begins_at_random():
+    """From zeros, none of several fronts would ever be the nearest."""
     rng = np.random.default_rng(0)
-    latents, centres = rng.normal(size=(5, 16, 3)), rng.normal(size=(5, 3))
-    none, every = (np.asarray(loop._read_outs(latents, centres, np.full(5, sided, np.float32))) for sided in (0, 1))
-    assert none.dtype == np.float32 and none.shape == (16, 3)
-    np.testing.assert_array_equal(none[:, 1], 0)
-    np.testing.assert_array_equal(none[:, [0, 2]], every[:, [0, 2]])
+    latents, centres, fold = rng.normal(size=(5, 16, 3)), rng.normal(size=(5, 3)), np.array([0, 2, 2, 4, 0], np.float32)
+    every = np.asarray(loop._read_outs(latents, centres, np.ones(5), 0))
+    first, again, other = (np.asarray(loop._read_outs(latents, centres, fold, seed)) for seed in (0, 0, 1))
+    assert first.dtype == np.float32 and first.shape == (16, 3)
+    np.testing.assert_array_equal(first, again)
+    np.testing.assert_array_equal(first[:, [0, 2]], every[:, [0, 2]])
+    assert np.abs(first[:, 1] - other[:, 1]).max() > 0.01
+    fronts = np.einsum("c,oci->oi", first[:, 1], latents)
+    assert 0.3 < np.sqrt(np.mean(np.sum(fronts**2, axis=1))) < 3  # about as long as they are asked to be
 
 
 def test_transfers_are_between_objects_of_a_kind_and_know_the_symmetry(two_sets):

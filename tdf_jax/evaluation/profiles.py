@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 DIRECTIONS = 48  # half planes about the axis, a multiple of 8
 LEVELS = 400  # 0.5 mm apart on a common bottle
-AXIS_LEVELS = 100
+AXIS_LEVELS = 50
 # Where the middle of an object without symmetry is its axis, shares of the height: a bottle's cap is above all handles, a bowl's lower half below all spouts.
 AXIS_FROM = {"bowl": (0.1, 0.5), "bottle": (0.9, 1.0)}
 TURNS = {ROUND: (1 / 8, 1 / 4), 2: (1 / 2,), 4: (1 / 4,)}  # of a full one, that leave an outline as it is
@@ -32,7 +32,7 @@ CURVES = np.linspace(1.0, 3.0, 17)  # of the shoulders tried, `BottleParameters.
 LOWEST_SHOULDER = 0.5  # of the height of the shoulder's middle: where it may begin; lower, barrels are taken for shoulders
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Profile:
     """How far an object reaches from its axis.
 
@@ -71,21 +71,23 @@ def profile(mesh: "trimesh.Trimesh", category: str, fold: int, name: str) -> Pro
     height = float(np.median([top for top in tops if top > -np.inf]))
     sections = tuple(section - [0.0, height / 2] for section in sections)
     radii = np.stack([_outermost(section, _levels(height)) for section in sections], axis=1)
-    if np.isfinite(radii[0]).sum() <= DIRECTIONS / 2:
-        raise InputError(f"profile(): {name} has no surface on most sides of its middle; expected one about its axis; repair the mesh, or correct its 'up'")
+    missing = int(np.isnan(radii[0]).sum())
+    if missing > DIRECTIONS / 4:
+        raise InputError(
+            f"profile(): {name} has no surface in {missing} of {DIRECTIONS} directions from its middle; expected one about its axis; repair the mesh, "
+            "or correct its 'up'"
+        )
     origin = axis + [0.0, 0.0, height / 2]
     around = _outline(radii)
     _check_symmetry(around, mesh.bounds - origin, fold, name)
     return Profile(origin, height, sections, radii, _turned(around, fold))
 
 
-def profile_places(
-    profile: Profile, category: str, fold: int, name: str, places: Collection[str]
-) -> dict[str, Float[np.ndarray, "4 4"]]:
+def profile_places(found: Profile, category: str, fold: int, name: str, places: Collection[str]) -> dict[str, Float[np.ndarray, "4 4"]]:
     """Frames of the places of a bowl or bottle.
 
     Args:
-        profile: of the mesh.
+        found: the mesh's profile.
         category: "bowl" or "bottle".
         fold: its symmetry, see `tdf_jax.symmetry`.
         name: of the mesh, for messages.
@@ -97,16 +99,16 @@ def profile_places(
     Raises:
         InputError: the mesh is not an open bowl with a wall, or not a bottle with a neck on a body, where a place to be measured needs it.
     """
-    half = profile.height / 2
-    found = {"base": frame(0.0, -half)}
+    half = found.height / 2
+    frames = {"base": frame(0.0, -half)}
     if category == "bowl":
-        found["body"] = frame(0.0, 0.0)
+        frames["body"] = frame(0.0, 0.0)
         if "rim" in places:
-            found["rim"] = frame(_rim(profile, fold, name), half)
-    elif set(places) - set(found):
-        neck, body = _bottle_levels(profile, fold, name)
-        found |= {"neck": frame(0.0, neck), "body": frame(0.0, body)}
-    return {place: found[place] for place in places}
+            frames["rim"] = frame(_rim(found, fold, name), half)
+    elif set(places) - set(frames):
+        neck, body = _bottle_levels(found, fold, name)
+        frames |= {"neck": frame(0.0, neck), "body": frame(0.0, body)}
+    return {place: frames[place] for place in places}
 
 
 def _levels(height: float) -> np.ndarray:
@@ -171,13 +173,12 @@ def _check_symmetry(around: np.ndarray, bounds: np.ndarray, fold: int, name: str
                 "or longer side at the front; correct 'front' and 'up'"
             )
         return
-    for turn in TURNS[fold]:
-        change = float(np.nanquantile(np.abs(around - np.roll(around, round(turn * DIRECTIONS))), 0.9))  # lugs aside
-        if change > CHANGE:
-            raise InputError(
-                f"profile(): {name} is not {FOLDS[fold]}: a turn of {360 * turn:g} degrees about 'up' changes its outline by {100 * change:.0f} % of its "
-                f"radius; expected {100 * CHANGE:.0f} % at most; correct 'symmetry' or 'up'"
-            )
+    changes = [np.nanquantile(np.abs(around - np.roll(around, round(turn * DIRECTIONS))), 0.9) for turn in TURNS[fold]]  # lugs aside
+    if max(changes) > CHANGE:
+        raise InputError(
+            f"profile(): {name} is not {FOLDS[fold]}: a turn of {360 * TURNS[fold][np.argmax(changes)]:g} degrees about 'up' changes its outline by "
+            f"{100 * max(changes):.0f} % of its radius; expected {100 * CHANGE:.0f} % at most; correct 'symmetry' or 'up'"
+        )
 
 
 def _turned(around: np.ndarray, fold: int) -> float:
@@ -214,13 +215,14 @@ def _bottle_levels(found: Profile, fold: int, name: str) -> tuple[float, float]:
     body = float(np.quantile(radius[: LEVELS // 2], 0.9))  # not the greatest: a seam; not the median: a waist
     neck = float(np.quantile(radius[LEVELS // 2 :], 0.2))
     for _ in range(4):  # the neck is what is above the shoulder's middle, which is half way between body and neck; settles after two
-        below = (radius < (body + neck) / 2) & (np.arange(LEVELS) >= LEVELS // 3)
+        below = (radius < (body + neck) / 2) & (np.arange(LEVELS) > np.argmax(radius[: LEVELS // 2]))
         if neck > NARROWER * body or not below.any():
             raise _unmeasured(name, "nothing above its body is narrow enough for a neck; is 'up' right?", wanted)
         above = int(np.argmax(below))
         neck = float(np.quantile(radius[above:], 0.3))  # most caps are wider than their neck
     half_way = float(np.interp((body + neck) / 2, radius[[above, above - 1]], levels[[above, above - 1]]))
-    body_to = _shoulder_from(levels[LEVELS // 8 : above], radius[LEVELS // 8 : above], half_way, neck, height)
+    upright = slice(above // 4, above)  # without the rounding of the bottom edge
+    body_to = _shoulder_from(levels[upright], radius[upright], half_way, neck, height)
     return half_way / 2, (body_to - height) / 2
 
 
@@ -239,7 +241,7 @@ def _shoulder_from(levels: np.ndarray, radius: np.ndarray, half_way: float, neck
     """Level above the base where the body ends.
 
     Of the shoulders of `BottleParameters` that are half as wide at `half_way`, on bodies with any bulge, the one that fits best up to there. The highest level
-    with 95 % of the body's radius was tried: it is in the middle of a dome, up to 46 mm too high on a bottle of 0.3 m.
+    with 95 % of the body's radius was tried: it is in the middle of a dome, up to 46 mm too high on a bottle of 0.27 m.
     """
     best, level = np.inf, half_way
     start = np.arange(LOWEST_SHOULDER * half_way, half_way, 0.0025 * height)[:, None]

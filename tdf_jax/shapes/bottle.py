@@ -18,6 +18,7 @@ SHOULDERS = ("arc", "slope")
 
 _TUBE_RINGS = 30  # rings along the handle
 _STEP = 2e-4  # of the height: over which a cap steps out from the neck
+_LEAST_CAP = 0.005  # of the height
 
 
 @dataclass(frozen=True)
@@ -197,6 +198,7 @@ def _check(p: BottleParameters) -> None:
     need(0.3 <= p.cap_taper <= 1.1, f"cap_taper is {p.cap_taper}; expected 0.3 to 1.1")
     need(p.edge_radius < p.shoulder_bottom < p.shoulder_top < p.height, "expected edge_radius, shoulder_bottom, shoulder_top and height to rise in this order")
     need(p.cap_height <= 0.98 * (p.height - p.shoulder_top), "cap_height must be less than the neck's")
+    need(p.cap_height == 0 or p.cap_height > _LEAST_CAP * p.height, f"cap_height must be 0 or more than {_LEAST_CAP} of height")
     need(abs(p.bulge) < 0.3 * p.radius, "bulge must be less than 0.3 of radius")
     need(p.edge_radius < 0.9 * p.radius * p.aspect, "edge_radius must be less than 0.9 of the smaller radius")
     need(p.neck_radius <= 0.9 * p.radius * p.aspect, "neck_radius must be less than 0.9 of the body's smaller radius")

@@ -48,7 +48,7 @@ class Batch:
         clouds: one of each object.
         queries, inside: labelled points, relative to the cloud's mean.
         centres: origins of the objects' frames, relative to the cloud's mean.
-        sided: 1 where the object has a front, the x axis of its frame; 0 where its symmetry leaves none.
+        fold: symmetry of the objects, see `tdf_jax.symmetry`: it tells which of the frame's axes there are.
         shown: query points at a place of each object, relative to its mean.
         offered: the same query points on the pair's other object, relative to that one's mean: first where the place has
             them there, then at wrong poses.
@@ -58,7 +58,7 @@ class Batch:
     queries: Float[np.ndarray, "pairs 2 queries 3"]
     inside: Float[np.ndarray, "pairs 2 queries"]
     centres: Float[np.ndarray, "pairs 2 3"]
-    sided: Float[np.ndarray, "pairs 2"]
+    fold: Float[np.ndarray, "pairs 2"]
     shown: Float[np.ndarray, "pairs 2 box 3"]
     offered: Float[np.ndarray, "pairs 2 poses box 3"]
 
@@ -143,9 +143,8 @@ class _Sample(NamedTuple):
     queries: np.ndarray
     inside: np.ndarray
     centre: np.ndarray
-    sided: bool
-    places: np.ndarray
     fold: int
+    places: np.ndarray
 
 
 def _sample(data, index, cloud, chosen, size):
@@ -153,8 +152,7 @@ def _sample(data, index, cloud, chosen, size):
     places = data.places[index].copy()
     places[:, :3, 3] = (places[:, :3, 3] - origin) * size
     queries, inside = (data.queries[index, chosen] - origin) * size, data.inside[index, chosen]
-    fold = int(data.fold[index])
-    return _Sample((cloud - origin) * size, queries, inside, -origin * size, fold == 1, places, fold)
+    return _Sample((cloud - origin) * size, queries, inside, -origin * size, int(data.fold[index]), places)
 
 
 def _pair(rng, samples, diagonal, box, poses):
@@ -171,7 +169,7 @@ def _pair(rng, samples, diagonal, box, poses):
         right = b.places[place] @ T_place_query
         wrong = [_unlike(rng, right, diagonal, x, b) for _ in range(poses - 1)]
         offered.append([_apply(T, x) for T in (right, *wrong)])
-    fields = (np.stack([getattr(sample, name) for sample in samples]) for name in ("cloud", "queries", "inside", "centre", "sided"))
+    fields = (np.stack([getattr(sample, name) for sample in samples]) for name in ("cloud", "queries", "inside", "centre", "fold"))
     return *fields, shown, offered
 
 

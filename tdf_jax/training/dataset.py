@@ -131,7 +131,8 @@ class DataSet:
 
     def digest(self) -> str:
         """A name for the contents, by which a resumed run knows its data again."""
-        return hashlib.sha256(self.surface.tobytes() + self.inside.tobytes()).hexdigest()[:16]
+        symmetry = b"" if (self.fold == 1).all() else self.fold.astype(np.int8).tobytes()  # runs on mugs keep the names they had
+        return hashlib.sha256(self.surface.tobytes() + self.inside.tobytes() + symmetry).hexdigest()[:16]
 
 
 def build(recipe: Recipe, directory: str | Path, workers: int = 1, progress: bool = True) -> None:

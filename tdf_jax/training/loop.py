@@ -23,7 +23,7 @@ from tdf_jax.optimize import OptimizeConfig
 from tdf_jax.training.batch import VALIDATION_DIAGONAL, Batch, draw, validation_pairs
 from tdf_jax.training.config import TrainConfig
 from tdf_jax.training.dataset import DataSet
-from tdf_jax.training.objective import FRAME_AXES, mean_gradient, pair_loss
+from tdf_jax.training.objective import FRONT, UP, mean_gradient, pair_loss
 from tdf_jax.training.record import METRICS, claim, drop_later_metrics, restore, save
 
 CORRUPTING = (0.1, 0.6)  # shares of the run
@@ -234,15 +234,19 @@ def _start(config, data, optimiser, initial):
         frame = jnp.zeros((config.network.latent, 3))
     else:
         network = jax.tree.map(jnp.array, initial)  # a copy: the first step takes its arguments over
-        frame = _read_outs(np.asarray(latents(network)), centres, samples.sided.reshape(8))
+        frame = _read_outs(np.asarray(latents(network)), centres, samples.fold.reshape(8), config.seed)
     params = {"network": network, "frame": frame}
     return params, {"optimiser": optimiser.init(params), "average": jax.tree.map(jnp.copy, params)}
 
 
-def _read_outs(latents, centres, sided):
+def _read_outs(latents, centres, fold, seed):
     """The frame's read-outs (latent, 3) that fit latents (objects, latent, 3) best; weights do not carry them."""
-    truths = np.stack([np.stack([*FRAME_AXES, centre], axis=1) for centre in centres])
-    read = [_fitted(latents[known], truths[known][..., number]) for number, known in enumerate((sided >= 0, sided > 0, sided >= 0))]
+    truths = np.stack([np.stack([UP, FRONT, centre], axis=1) for centre in centres])
+    known = fold >= 0, fold == 1, fold >= 0
+    read = [_fitted(latents[these], truths[these][..., number]) for number, these in enumerate(known)]
+    if not (fold == 1).any():
+        # From zeros, none of a symmetric object's fronts would ever be nearer than another.
+        read[1] = np.random.default_rng([seed, 3]).normal(size=latents.shape[1]) / np.sqrt(np.mean(np.sum(latents**2, axis=(1, 2))))
     return jnp.asarray(np.stack(read, axis=1), jnp.float32)
 
 
