@@ -80,13 +80,18 @@ def test_the_wall_is_as_thick_as_asked_across_it(name):
         np.testing.assert_array_equal(bowl.contains(surface + share * p.wall_thickness * inward), clay, err_msg=f"{share}")
 
 
-def test_a_drawn_in_rim_has_the_walls_thickness_and_a_top():
-    p = BowlParameters(rim_flare=-0.006, lip_radius=0.0018)
+@pytest.mark.parametrize("change", [
+    {"rim_flare": -0.006},
+    {"rim_flare": -0.012, "height": 0.040},  # leaning in by more than 45 degrees
+])  # fmt: skip
+def test_a_drawn_in_rim_has_the_walls_thickness_and_a_top(change):
+    p = BowlParameters(**change, lip_radius=0.0018)
     bowl = build_bowl(p)
     np.testing.assert_allclose(bowl.mesh.bounds[1, 2], p.height / 2, atol=1e-6)
     assert bowl.contains(bowl.frames["rim"][None, :3, 3] - [0, 0, 1e-5]).all()
     sharp = build_bowl(replace(p, lip_radius=0.0))
-    across = np.ptp(clay_along(sharp, p.height - 1e-4)) / np.hypot(1, 2 * 0.006 / 0.012)  # the rim leans in by 1 in 1
+    low, high = outer(sharp, [p.height - 4e-4, p.height - 1e-4])
+    across = np.ptp(clay_along(sharp, p.height - 1e-4)) / np.hypot(1, (low - high) / 3e-4)
     np.testing.assert_allclose(across, p.wall_thickness, rtol=0.1)
 
 

@@ -331,6 +331,16 @@ def test_without_an_object_of_one_front_its_read_out_begins_at_random():
     assert 0.3 < np.sqrt(np.mean(np.sum(fronts**2, axis=1))) < 3  # about as long as they are asked to be
 
 
+@pytest.mark.parametrize("fold", [2, 4])
+def test_a_run_from_the_beginning_can_learn_a_front_of_objects_that_have_several(sets, fold):
+    data = dataclasses.replace(sets[0], fold=np.full_like(sets[0].fold, fold))
+    params, _ = loop._start(CONFIG, data, loop._optimiser(CONFIG), None)
+    rng = np.random.default_rng(0)
+    latent, centre = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((16, 3), 3))
+    gradient = jax.grad(frame_error)({"frame": params["frame"]}, latent, centre, jnp.float32(fold))["frame"]
+    assert np.abs(gradient[:, 1]).max() > 1e-3
+
+
 def test_transfers_are_between_objects_of_a_kind_and_know_the_symmetry(two_sets):
     validation = two_sets[1]
     transfers = loop._transfers(validation)

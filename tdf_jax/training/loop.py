@@ -232,6 +232,8 @@ def _start(config, data, optimiser, initial):
         final = network["encoder"]["fc_c"]["map_to_feat"]
         final["kernel"] = final["kernel"] * (0.5 / jnp.sqrt(jnp.mean(latents(network) ** 2)))
         frame = jnp.zeros((config.network.latent, 3))
+        if not (data.fold == 1).any():
+            frame = frame.at[:, 1].set(_any_front(np.asarray(latents(network)), config.seed))
     else:
         network = jax.tree.map(jnp.array, initial)  # a copy: the first step takes its arguments over
         frame = _read_outs(np.asarray(latents(network)), centres, samples.fold.reshape(8), config.seed)
@@ -245,9 +247,13 @@ def _read_outs(latents, centres, fold, seed):
     known = fold >= 0, fold == 1, fold >= 0
     read = [_fitted(latents[these], truths[these][..., number]) for number, these in enumerate(known)]
     if not (fold == 1).any():
-        # From zeros, none of a symmetric object's fronts would ever be nearer than another.
-        read[1] = np.random.default_rng([seed, 3]).normal(size=latents.shape[1]) / np.sqrt(np.mean(np.sum(latents**2, axis=(1, 2))))
+        read[1] = _any_front(latents, seed)
     return jnp.asarray(np.stack(read, axis=1), jnp.float32)
+
+
+def _any_front(latents, seed):
+    """A read-out (latent,) of vectors about 1 long: from zeros, none of a symmetric object's fronts would ever be nearer than another."""
+    return np.random.default_rng([seed, 3]).normal(size=latents.shape[1]) / np.sqrt(np.mean(np.sum(latents**2, axis=(1, 2))))
 
 
 def _fitted(latents, truths):
