@@ -223,7 +223,7 @@ def test_a_contact_sheet_shows_generated_and_real_objects(real, tmp_path, monkey
     monkeypatch.setattr(sheet, "contact_sheet", lambda objects: drawn.extend(objects) or contact_sheet(objects))
     run("shapes", "--category", "bowl", "--out", tmp_path / "sheet.png", "--count", 3, "--meshes", real)
     assert (tmp_path / "sheet.png").read_bytes().startswith(b"\x89PNG")
-    assert [title for title, _ in drawn][-1] == "dish: round" and len(drawn) == 4
+    assert [title for title, _ in drawn][-1] == "dish\nround" and len(drawn) == 4
     assert {title for title, _ in drawn[:3]} <= set(FOLDS.values())
 
 

@@ -32,6 +32,6 @@ def contact_sheet(objects: "Sequence[tuple[str, trimesh.Trimesh]]", columns: int
             axes.set_box_aspect((1, 1, 1), zoom=1.45)
             axes.view_init(elev=25, azim=-60)
             axes.set_axis_off()
-            axes.set_title(title, y=-0.12, fontsize=6.5)
-        figure.subplots_adjust(left=0, right=1, bottom=0.03, top=1, wspace=0, hspace=0.12)
+            axes.set_title(title, y=-0.12, va="top", fontsize=6)
+        figure.subplots_adjust(left=0, right=1, bottom=0.07, top=1, wspace=0, hspace=0.12)
     return figure
