@@ -12,11 +12,12 @@ from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
 from tdf_jax import poses
-from tdf_jax.cli import scene
+from tdf_jax.cli import scene, scores
 from tdf_jax.cli.main import main
 from tdf_jax.cli.settings import Settings, categories_of, resolved
 from tdf_jax.evaluation.annotated import AnnotatedMesh
 from tdf_jax.evaluation.cases import generated_case, mesh_case, object_of, size_of
+from tdf_jax.evaluation.summary import summary
 from tdf_jax.evaluation.transfer import place_errors
 from tdf_jax.shapes import FAMILIES
 from tdf_jax.symmetry import FOLDS, about_z
@@ -194,6 +195,22 @@ def test_categories_are_evaluated_one_after_the_other(weights, real, tmp_path, c
     card = (tmp_path / "card.md").read_text()
     assert "Real bowls: 1 at their own size, none seen in training, 1 transfers of the rim." in card
     assert "--category bowl bottle" in card
+
+
+def test_a_summary_tells_symmetries_apart(bottles):
+    cases = [bottles[0], bottles[2], bottles[0], bottles[4]]
+    ious = {"iou": [0.9, 0.5, 0.7, None], "iou_refined": [0.8, 0.6, 0.8, None]}
+    row = summary(np.array([0.001, 0.03, 0.015, 0.001]), np.array([1.0, 1.0, 1.0, 30.0]), ious, cases)
+    assert list(row["by_symmetry"]) == ["round", "two-fold", "four-fold"]
+    assert row["by_symmetry"]["round"] == {
+        "cases": 2, "iou": pytest.approx(0.8), "iou_refined": pytest.approx(0.8),
+        "success_5mm_5deg": 0.5, "success_1cm_10deg": 0.5, "success_2cm_20deg": 1.0,
+    }  # fmt: skip
+    assert row["by_symmetry"]["two-fold"]["success_2cm_20deg"] == 0 and row["by_symmetry"]["four-fold"]["iou"] is None
+    told = scores.by_symmetry(row)
+    assert told[0] == ["round", "2", "0.800", "0.800", "50 %", "50 %", "100 %"] and told[2][:4] == ["four-fold", "1", "n/a", "n/a"]
+    alike = summary(np.zeros(2), np.zeros(2), {"iou": [0.9, 0.9]}, [bottles[1]] * 2)
+    assert list(alike["by_symmetry"]) == ["none"] and scores.by_symmetry(alike) == []
 
 
 @pytest.mark.parametrize(("words", "message"), [

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from tdf_jax.cli.scores import THRESHOLDS, Outcomes, is_real, overlap_cells, place, successes
+from tdf_jax.cli.scores import SYMMETRY_HEADS, THRESHOLDS, Outcomes, by_symmetry, is_real, overlap_cells, place, successes
 from tdf_jax.files import replace_file
 from tdf_jax.model import Model
 from tdf_jax.network import parameter_count
@@ -47,6 +47,10 @@ def card(model: Model, outcomes: Outcomes, settings: dict) -> str:
         heads = ["cloud", "method", "IoU", "refined", "position, median / 90 %", "rotation, median / 90 %", "flips", *THRESHOLDS.values()]
         lines += [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
         lines += [f"| {' | '.join(_cells(clouds, outcome))} |" for clouds, outcome in rows]
+        apart = [[MEANINGS[clouds], outcome.method, *cells] for clouds, outcome in rows for cells in by_symmetry(outcome.summary)]
+        if apart:
+            heads = ["cloud", "method", *SYMMETRY_HEADS]
+            lines += ["", "The same by symmetry:", "", f"| {' | '.join(heads)} |", "|" + "---|" * len(heads), *(f"| {' | '.join(cells)} |" for cells in apart)]
         lines += [""]
     return "\n".join(lines).rstrip() + "\n"
 

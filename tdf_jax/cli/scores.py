@@ -44,9 +44,13 @@ def table(outcomes: Outcomes, settings: dict) -> str:
         first = rows[0][1].summary
         lines += ["", f"{objects}: {first['objects']} objects, {first['cases']} transfers of the {place(objects, settings)}; {told}"]
         lines += _aligned([_HEADS, _UNITS, *(_cells(clouds, outcome) for clouds, outcome in rows)])
+        apart = [(outcome.method, clouds, *cells) for clouds, outcome in rows for cells in by_symmetry(outcome.summary)]
+        if apart:
+            lines += ["", *_aligned([("method", "cloud", *SYMMETRY_HEADS), *apart])]
     return "\n".join(lines[1:])
 
 
+SYMMETRY_HEADS = ["symmetry", "cases", "IoU", "refined", *THRESHOLDS.values()]
 _HEADS = ["method", "cloud", "IoU", "refined", "position, cm", "position, diagonals", "rotation, deg", "flips", *THRESHOLDS.values()]
 _UNITS = ["", "", "", "", *["median / p90"] * 3, "", *["success (95 %)"] * 3]
 
@@ -57,6 +61,17 @@ def _cells(clouds: str, outcome: Outcome) -> list[str]:
     for name, unit, form in (("position", "cm", "5.2f"), ("position", "diagonals", ".3f"), ("rotation", "deg", "5.1f")):
         cells.append(" / ".join(format(row[f"{name}_{kind}_{unit}"], form) for kind in ("median", "p90")))
     return [*cells, str(row["flips"]), *successes(row)]
+
+
+def by_symmetry(row: dict) -> list[list[str]]:
+    """Cells under `SYMMETRY_HEADS` of a summary, a line for each symmetry; none if all objects have the same."""
+    parts = row["by_symmetry"]
+    if len(parts) < 2:
+        return []
+    return [
+        [name, str(part["cases"]), *overlap_cells(part), *(f"{100 * part[f'success_{threshold}']:.0f} %" for threshold in THRESHOLDS)]
+        for name, part in parts.items()
+    ]
 
 
 def overlap_cells(row: dict) -> list[str]:

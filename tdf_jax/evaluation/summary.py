@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from tdf_jax.evaluation.cases import Case
 from tdf_jax.evaluation.truth import FLIP_DEGREES
+from tdf_jax.symmetry import FOLDS
 
 THRESHOLDS = {"5mm_5deg": (0.005, 5.0), "1cm_10deg": (0.01, 10.0), "2cm_20deg": (0.02, 20.0)}  # metres, degrees
 RESAMPLES = 2000  # of the bootstrap
@@ -31,7 +32,8 @@ def summary(
         seed: of the bootstrap.
 
     Returns:
-        Plain numbers by name; None for an IoU where no case has one, and for the intervals of a single object.
+        Plain numbers by name; None for an IoU where no case has one, and for the intervals of a single object. Under "by_symmetry" success rates and IoUs of the objects of
+        each symmetry.
     """
     share = distance / [case.diagonal for case in cases]
     known = {name: [iou for iou in several if iou is not None] for name, several in ious.items()}
@@ -57,4 +59,18 @@ def summary(
         rates = hits[drawn].sum(axis=1) / tries[drawn].sum(axis=1)
         row[f"success_{name}"] = float(hit.mean())
         row[f"interval_{name}"] = [float(x) for x in np.percentile(rates, (2.5, 97.5))] if len(names) > 1 else None
-    return row
+    return row | {"by_symmetry": _by_symmetry(distance, angle, ious, cases)}
+
+
+def _by_symmetry(distance, angle, ious, cases) -> dict:
+    """The rates and IoUs of objects of each symmetry alone, by its name."""
+    folds, parts = np.array([case.fold for case in cases]), {}
+    for fold, name in FOLDS.items():
+        chosen = folds == fold
+        if not chosen.any():
+            continue
+        known = {key: [iou for iou, kept in zip(several, chosen) if kept and iou is not None] for key, several in ious.items()}
+        parts[name] = {"cases": int(chosen.sum())} | {key: float(np.mean(several)) if several else None for key, several in known.items()}
+        for threshold, (metres, degrees) in THRESHOLDS.items():
+            parts[name][f"success_{threshold}"] = float(np.mean((distance[chosen] <= metres) & (angle[chosen] <= degrees)))
+    return parts
