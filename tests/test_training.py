@@ -355,7 +355,6 @@ def test_transfers_are_between_objects_of_a_kind_and_know_the_symmetry(two_sets)
         np.testing.assert_allclose(np.linalg.inv(T) @ transfer.T_world_place_b, place, atol=1e-6)
 
 
-@pytest.mark.xfail(strict=True, raises=IndexError, reason="the run ends in the mean of no losses at its first validation")
 def test_validation_objects_without_another_of_their_kind_are_refused(train, sets, tmp_path):
     alone = dataclasses.replace(sets[1], fold=np.array([0, 2], np.int8))
     with pytest.raises(InputError, match="validation"):

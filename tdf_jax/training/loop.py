@@ -70,6 +70,10 @@ def train(
             f"train(): points is {config.points}, but a camera sees {seen} of an object's {data.surface.shape[1]} surface points; "
             "expected no more than it sees: lower points, or build the data set with more"
         )
+    if not len(validation.pairs()):
+        raise InputError(
+            "train(): no two validation objects are of one data set and symmetry; expected at least a pair; build the data set with more (--validation)"
+        )
     claim(directory, dataclasses.asdict(config) | {"data": data.digest(), "initial": _digest(initial)})
     measured = {
         name: validation_pairs(validation, config.points, VALIDATION_BOX, VALIDATION_POSES, one_view)
