@@ -18,7 +18,7 @@ from tdf_jax.cli.settings import Settings, categories_of, resolved
 from tdf_jax.evaluation.annotated import AnnotatedMesh
 from tdf_jax.evaluation.cases import generated_case, mesh_case, object_of, size_of
 from tdf_jax.evaluation.summary import summary
-from tdf_jax.evaluation.transfer import place_errors
+from tdf_jax.evaluation.transfer import place_errors, tilts
 from tdf_jax.shapes import FAMILIES
 from tdf_jax.symmetry import FOLDS, about_z
 from tdf_jax.viz import sheet
@@ -115,6 +115,18 @@ def test_an_error_that_no_symmetry_makes_good_stays_whole(bottles, fold):
     assert distance[0] == pytest.approx(0.02, abs=1e-5) and angle[0] == pytest.approx(15, abs=0.1)
 
 
+@pytest.mark.parametrize("fold", FOLDS)
+def test_a_tilt_is_what_no_turn_about_the_axis_changes(bottles, fold):
+    case = bottles[fold]
+    local = np.linalg.inv(case.T_world_b) @ case.T_world_place_b
+    for turn in (0, 70, 180):
+        for lean in (0, 25, 160):
+            leaning = np.eye(4)
+            leaning[:3, :3] = Rotation.from_euler("x", lean, degrees=True).as_matrix()
+            found = case.T_world_b @ about_z(np.radians(turn)) @ local @ leaning
+            np.testing.assert_allclose(tilts(pose_of(found)[None], [case]), [lean], atol=0.05)
+
+
 # Scenes
 
 
@@ -200,15 +212,16 @@ def test_categories_are_evaluated_one_after_the_other(weights, real, tmp_path, c
 def test_a_summary_tells_symmetries_apart(bottles):
     cases = [bottles[0], bottles[2], bottles[0], bottles[4]]
     ious = {"iou": [0.9, 0.5, 0.7, None], "iou_refined": [0.8, 0.6, 0.8, None]}
-    row = summary(np.array([0.001, 0.03, 0.015, 0.001]), np.array([1.0, 1.0, 1.0, 30.0]), ious, cases)
+    row = summary(np.array([0.001, 0.03, 0.015, 0.001]), np.array([1.0, 1.0, 1.0, 30.0]), ious, cases, tilt=np.array([1.0, 1.0, 21.0, 2.0]))
     assert list(row["by_symmetry"]) == ["round", "two-fold", "four-fold"]
     assert row["by_symmetry"]["round"] == {
         "cases": 2, "iou": pytest.approx(0.8), "iou_refined": pytest.approx(0.8),
-        "success_5mm_5deg": 0.5, "success_1cm_10deg": 0.5, "success_2cm_20deg": 1.0,
+        "success_5mm_5deg": 0.5, "success_1cm_10deg": 0.5, "success_2cm_20deg": 1.0, "success_axis_2cm_20deg": 0.5,
     }  # fmt: skip
     assert row["by_symmetry"]["two-fold"]["success_2cm_20deg"] == 0 and row["by_symmetry"]["four-fold"]["iou"] is None
     told = scores.by_symmetry(row)
-    assert told[0] == ["round", "2", "0.800", "0.800", "50 %", "50 %", "100 %"] and told[2][:4] == ["four-fold", "1", "n/a", "n/a"]
+    assert told[0] == ["round", "2", "0.800", "0.800", "50 %", "50 %", "100 %", "50 %"]
+    assert told[2] == ["four-fold", "1", "n/a", "n/a", "0 %", "0 %", "0 %", "100 %"]  # at its place and upright, but turned
     alike = summary(np.zeros(2), np.zeros(2), {"iou": [0.9, 0.9]}, [bottles[1]] * 2)
     assert list(alike["by_symmetry"]) == ["none"] and scores.by_symmetry(alike) == []
 

@@ -50,7 +50,7 @@ def table(outcomes: Outcomes, settings: dict) -> str:
     return "\n".join(lines[1:])
 
 
-SYMMETRY_HEADS = ["symmetry", "cases", "IoU", "refined", *THRESHOLDS.values()]
+SYMMETRY_HEADS = ["symmetry", "cases", "IoU", "refined", *THRESHOLDS.values(), "axis: 2 cm, 20 deg"]
 _HEADS = ["method", "cloud", "IoU", "refined", "position, cm", "position, diagonals", "rotation, deg", "flips", *THRESHOLDS.values()]
 _UNITS = ["", "", "", "", *["median / p90"] * 3, "", *["success (95 %)"] * 3]
 
@@ -69,9 +69,13 @@ def by_symmetry(row: dict) -> list[list[str]]:
     if len(parts) < 2:
         return []
     return [
-        [name, str(part["cases"]), *overlap_cells(part), *(f"{100 * part[f'success_{threshold}']:.0f} %" for threshold in THRESHOLDS)]
+        [name, str(part["cases"]), *overlap_cells(part), *(_percent(part[f"success_{threshold}"]) for threshold in (*THRESHOLDS, "axis_2cm_20deg"))]
         for name, part in parts.items()
     ]
+
+
+def _percent(share: float | None) -> str:
+    return "n/a" if share is None else f"{100 * share:.0f} %"
 
 
 def overlap_cells(row: dict) -> list[str]:

@@ -11,7 +11,7 @@ from tdf_jax.errors import InputError
 from tdf_jax.evaluation.baselines import METHODS, aligned
 from tdf_jax.evaluation.cases import Case
 from tdf_jax.evaluation.summary import summary
-from tdf_jax.evaluation.transfer import no_overlaps, overlaps, place_errors, transferred
+from tdf_jax.evaluation.transfer import no_overlaps, overlaps, place_errors, tilts, transferred
 from tdf_jax.model import Model
 from tdf_jax.network import initialise
 from tdf_jax.optimize import OptimizeConfig
@@ -86,4 +86,4 @@ def random_weights(model: Model, seed: int) -> Model:
 
 def _outcome(method, cases, found, ious, seed) -> Outcome:
     distance, angle = place_errors(found, cases)
-    return Outcome(method, cases, found, distance, angle, ious, summary(distance, angle, ious, cases, seed))
+    return Outcome(method, cases, found, distance, angle, ious, summary(distance, angle, ious, cases, seed, tilts(found, cases)))

@@ -19,6 +19,7 @@ def summary(
     ious: Mapping[str, Sequence[float | None]],
     cases: Sequence[Case],
     seed: int = 0,
+    tilt: Float[np.ndarray, "cases"] | None = None,
 ) -> dict:
     """Medians, 90th percentiles, success rates with 95 % bootstrap intervals over objects, and flips.
 
@@ -30,6 +31,7 @@ def summary(
         ious: by name; None where there is none.
         cases: what the errors are of.
         seed: of the bootstrap.
+        tilt: of the place's upright axis, degrees; of symmetric objects an error of this alone tells who stands right but turned.
 
     Returns:
         Plain numbers by name; None for an IoU where no case has one, and for the intervals of a single object. Under "by_symmetry" success rates and IoUs of the objects of
@@ -59,10 +61,10 @@ def summary(
         rates = hits[drawn].sum(axis=1) / tries[drawn].sum(axis=1)
         row[f"success_{name}"] = float(hit.mean())
         row[f"interval_{name}"] = [float(x) for x in np.percentile(rates, (2.5, 97.5))] if len(names) > 1 else None
-    return row | {"by_symmetry": _by_symmetry(distance, angle, ious, cases)}
+    return row | {"by_symmetry": _by_symmetry(distance, angle, ious, cases, tilt)}
 
 
-def _by_symmetry(distance, angle, ious, cases) -> dict:
+def _by_symmetry(distance, angle, ious, cases, tilt) -> dict:
     """The rates and IoUs of objects of each symmetry alone, by its name."""
     folds, parts = np.array([case.fold for case in cases]), {}
     for fold, name in FOLDS.items():
@@ -73,4 +75,7 @@ def _by_symmetry(distance, angle, ious, cases) -> dict:
         parts[name] = {"cases": int(chosen.sum())} | {key: float(np.mean(several)) if several else None for key, several in known.items()}
         for threshold, (metres, degrees) in THRESHOLDS.items():
             parts[name][f"success_{threshold}"] = float(np.mean((distance[chosen] <= metres) & (angle[chosen] <= degrees)))
+        metres, degrees = THRESHOLDS["2cm_20deg"]
+        upright = None if tilt is None else float(np.mean((distance[chosen] <= metres) & (tilt[chosen] <= degrees)))
+        parts[name]["success_axis_2cm_20deg"] = upright
     return parts

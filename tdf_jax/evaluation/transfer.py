@@ -63,6 +63,13 @@ def place_errors(
     return distance, np.degrees(angle)
 
 
+def tilts(found: Float[np.ndarray, "cases 7"], cases: Sequence[Transfer]) -> Float[np.ndarray, "cases"]:
+    """How far poses found for cases are from upright on their object, degrees: the angle between the place's z axis as found and in truth."""
+    up = np.asarray(Trajectory(jnp.asarray(found)).matrices, float)[:, :3, 2]
+    true = np.stack([case.T_world_place_b[:3, 2] for case in cases])
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(up, true), axis=1), np.sum(up * true, axis=1)))
+
+
 def place_reference(model: Model, case: Transfer, query: Float[Array, "queries 3"]) -> Reference:
     """The demonstration of one pose: the query frame at the place on object a."""
     field = encode(model, case.points_a)
