@@ -288,7 +288,7 @@ def test_sampled_bottles_are_built_and_have_every_symmetry():
     ({"edge_radius": 0.020, "aspect": 0.6}, "edge_radius must be less than 0.9 of the smaller radius"),
     ({"neck_radius": 0.033}, "neck_radius must be less than 0.9 of the body's smaller radius"),
     ({"aspect": 0.4}, "neck_radius must be less than 0.9 of the body's smaller radius"),
-    ({"cap_radius": 0.0139}, "cap_radius must be at least that of the neck's top"),
+    ({"cap_radius": 0.0139}, "cap_radius must be at least that of the neck within the cap"),
     ({"cap_height": 0.0, "mouth_depth": 0.082}, "mouth_depth must be less than the height of neck and shoulder"),
 ])  # fmt: skip
 def test_bad_dimensions_are_refused_by_name(change, message):
@@ -335,3 +335,14 @@ def test_dimensions_at_the_ends_of_their_ranges_are_built(change):
     bottle = build_bottle(replace(PLAIN, **change))
     assert bottle.mesh.is_watertight and bottle.mesh.body_count == 1
     assert bottle.mesh.euler_number == (0 if "handle" in change else 2)
+
+
+@pytest.mark.parametrize("handle", ["no", 2, None])
+def test_a_handle_is_there_or_not(handle):
+    with pytest.raises(InputError, match="handle is .*; expected True or False"):
+        build_bottle(BottleParameters(handle=handle))
+
+
+def test_a_cap_is_no_narrower_than_the_neck_it_sits_on():
+    with pytest.raises(InputError, match="cap_radius must be at least that of the neck within the cap"):
+        build_bottle(BottleParameters(neck_taper=0.5, cap_radius=0.0075))

@@ -83,6 +83,7 @@ def test_the_wall_is_as_thick_as_asked_across_it(name):
 @pytest.mark.parametrize("change", [
     {"rim_flare": -0.006},
     {"rim_flare": -0.012, "height": 0.040},  # leaning in by more than 45 degrees
+    {"rim_flare": -0.018, "height": 0.030},  # by 80
 ])  # fmt: skip
 def test_a_drawn_in_rim_has_the_walls_thickness_and_a_top(change):
     p = BowlParameters(**change, lip_radius=0.0018)

@@ -202,7 +202,8 @@ def _check(p: BottleParameters) -> None:
     need(abs(p.bulge) < 0.3 * p.radius, "bulge must be less than 0.3 of radius")
     need(p.edge_radius < 0.9 * p.radius * p.aspect, "edge_radius must be less than 0.9 of the smaller radius")
     need(p.neck_radius <= 0.9 * p.radius * p.aspect, "neck_radius must be less than 0.9 of the body's smaller radius")
-    need(p.cap_height == 0 or p.cap_radius >= p.neck_radius * p.neck_taper, "cap_radius must be at least that of the neck's top")
+    widest = max(_neck(p, p.height - p.cap_height), _neck(p, p.height))
+    need(p.cap_height == 0 or p.cap_radius >= widest, "cap_radius must be at least that of the neck within the cap")
     need(p.cap_height > 0 or p.mouth_depth < 0.9 * (p.height - p.shoulder_bottom), "mouth_depth must be less than the height of neck and shoulder")
     if p.handle:
         _check_handle(p, need)

@@ -177,8 +177,9 @@ def _inner_radius(p: BowlParameters, levels: np.ndarray) -> np.ndarray:
     along /= np.linalg.norm(along, axis=0)
     inner_radius, inner_height = radius - p.wall_thickness * along[1], height + p.wall_thickness * along[0]
     # Of a side that leans in it ends below the rim: straight on from there.
-    inner_radius = np.append(inner_radius, inner_radius[-1] + 4 * p.wall_thickness * along[0, -1])
-    inner_height = np.append(inner_height, inner_height[-1] + 4 * p.wall_thickness * along[1, -1])
+    further = max(height[-1] - inner_height[-1], 0) / along[1, -1] + p.wall_thickness
+    inner_radius = np.append(inner_radius, inner_radius[-1] + further * along[0, -1])
+    inner_height = np.append(inner_height, inner_height[-1] + further * along[1, -1])
     order = np.argsort(inner_height)
     return np.interp(levels, inner_height[order], inner_radius[order])
 

@@ -138,10 +138,12 @@ def check_numbers(function: str, parameters, *, may_be_zero: tuple[str, ...], ma
     """Raise InputError unless all parameters but names are finite numbers of the right sign."""
     for field in dataclasses.fields(parameters):
         name, value = field.name, getattr(parameters, field.name)
-        if field.type in (str, bool):
+        if field.type is str:
             continue
         wrong = None
-        if not (isinstance(value, Real) and np.isfinite(value)):
+        if field.type is bool:
+            wrong = None if isinstance(value, bool) else f"{name} is {value!r}; expected True or False"
+        elif not (isinstance(value, Real) and np.isfinite(value)):
             wrong = f"{name} is {value!r}; expected a finite number"
         elif not (value > 0 or name in may_be_zero or name in may_be_negative):
             wrong = f"{name} is {value}; expected a positive number"
