@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tdf_jax.errors import InputError
-from tdf_jax.shapes.shape import Clay, Shape, check_numbers, frame, is_one_body, moulded
+from tdf_jax.shapes.shape import Clay, Shape, accepted, check_numbers, frame, is_one_body, moulded
 from tdf_jax.shapes.solid import Loft, bar_line, bends_freely, encloses, inset, section, swept, tube_rings
 from tdf_jax.symmetry import ROUND
 
@@ -132,13 +132,7 @@ def sample_bottle(rng: np.random.Generator) -> BottleParameters:
     Returns:
         Dimensions that `build_bottle` accepts.
     """
-    while True:  # most draws with a handle ask for one that does not fit
-        parameters = _draw(rng)
-        try:
-            _check(parameters)
-        except InputError:
-            continue
-        return parameters
+    return accepted(_draw, _check, rng)  # most draws with a handle ask for one that does not fit
 
 
 def _draw(rng: np.random.Generator) -> BottleParameters:

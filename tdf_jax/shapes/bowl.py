@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tdf_jax.errors import InputError
-from tdf_jax.shapes.shape import Clay, Shape, check_numbers, frame, is_one_body, moulded
+from tdf_jax.shapes.shape import Clay, Shape, accepted, check_numbers, frame, is_one_body, moulded
 from tdf_jax.shapes.solid import Loft, inset, section
 from tdf_jax.symmetry import ROUND
 
@@ -105,13 +105,7 @@ def sample_bowl(rng: np.random.Generator) -> BowlParameters:
     Returns:
         Dimensions that `build_bowl` accepts.
     """
-    while True:  # some draws ask for a floor thicker than a shallow bowl has room for
-        parameters = _draw(rng)
-        try:
-            _check(parameters)
-        except InputError:
-            continue
-        return parameters
+    return accepted(_draw, _check, rng)  # some draws ask for a floor thicker than a shallow bowl has room for
 
 
 def _draw(rng: np.random.Generator) -> BowlParameters:

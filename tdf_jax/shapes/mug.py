@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tdf_jax.errors import InputError
-from tdf_jax.shapes.shape import Clay, Shape, check_numbers, frame, is_one_body, moulded
+from tdf_jax.shapes.shape import Clay, Shape, accepted, check_numbers, frame, is_one_body, moulded
 from tdf_jax.shapes.solid import Solid, Tube, bar_line, bends_freely, in_solid, inset, polygon, swept, tube_rings
 
 HANDLE_STYLES = ("d", "ring", "ear", "square")
@@ -152,13 +152,7 @@ def sample_mug(rng: np.random.Generator) -> MugParameters:
     Returns:
         Dimensions that `build_mug` accepts.
     """
-    while True:  # about one draw in ten asks for a handle that does not fit its body
-        parameters = _draw(rng)
-        try:
-            _check(parameters)
-        except InputError:
-            continue
-        return parameters
+    return accepted(_draw, _check, rng)  # about one draw in ten asks for a handle that does not fit its body
 
 
 def _draw(rng: np.random.Generator) -> MugParameters:

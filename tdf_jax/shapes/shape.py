@@ -127,6 +127,17 @@ def scaled(shape: Shape, factor: float) -> Shape:
     return dataclasses.replace(shape, mesh=shape.mesh.copy().apply_scale(factor), parameters=parameters, frames=frames)
 
 
+def accepted(draw, check, rng: np.random.Generator):
+    """The first drawn parameters that a check does not refuse."""
+    while True:
+        parameters = draw(rng)
+        try:
+            check(parameters)
+        except InputError:
+            continue
+        return parameters
+
+
 def frame(x: float, z: float, outward: float = 1.0) -> Float[np.ndarray, "4 4"]:
     """T_object_frame at (x, 0, z), z up, its x axis along object x times `outward` (1 or -1)."""
     T = np.diag([outward, outward, 1.0, 1.0])
