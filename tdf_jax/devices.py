@@ -15,9 +15,14 @@ ACCELERATOR_POINTS = 16384
 ONCE = {"xla_backend_optimization_level": 0}  # for programs that run once a call: half the time to compile
 
 
+def one_at_a_time() -> bool:
+    """Whether equal work is faster one piece after the other: on a CPU, whose cache then holds it; an accelerator wants all of it together."""
+    return jax.default_backend() == "cpu"
+
+
 def points_at_a_time(cpu_points: int) -> int:
     """How many query points to evaluate at a time: a CPU wants them in its cache, an accelerator wants many."""
-    return cpu_points if jax.default_backend() == "cpu" else ACCELERATOR_POINTS
+    return cpu_points if one_at_a_time() else ACCELERATOR_POINTS
 
 
 def check_mesh(function: str, mesh) -> None:

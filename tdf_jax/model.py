@@ -110,6 +110,7 @@ def encode(model: Model, points: Float[Array, "points 3"], thinnings: int = THIN
     plain = not thinnings or count is None
     dense = not plain and len(points) > count
     traced = isinstance(points, jax.core.Tracer)
+    tip = points[((points - points.mean(axis=0)) ** 2).sum(axis=1).argmax()]  # of all points: every thinning is displaced alike
     if traced and dense:
         raise InputError(
             f"encode(): {len(points)} points cannot be thinned to {count} under jax.jit; expected that many. "
@@ -117,20 +118,20 @@ def encode(model: Model, points: Float[Array, "points 3"], thinnings: int = THIN
         )
     clouds = pointcloud.thinnings(np.asarray(points), count, thinnings) if dense else points[None]
     if traced or any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(model.params)):
-        return _average(model.params, model.config, clouds)
+        return _average(model.params, model.config, clouds, tip)
     several, size = clouds.shape[:2]
     # Filled up with clouds and points that do not count: clouds of many sizes run one program.
     room = (1, -(-size // ROOM) * ROOM) if plain else (thinnings, count)
-    return _encode(model.params, model.config, np.resize(clouds, (*room, 3)), np.int32(several), np.int32(size))
+    return _encode(model.params, model.config, np.resize(clouds, (*room, 3)), np.int32(several), np.int32(size), tip)
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _encode(params, config, clouds, several, size):
+def _encode(params, config, clouds, several, size, tip):
     """The field of the first `several` clouds, averaged, of each of which the first `size` points count; the others are repetitions."""
     used = jnp.arange(clouds.shape[1]) < size
 
     def fill(index, state):
-        return jax.tree.map(lambda all, one: all.at[index].set(one), state, _latent(params, config, clouds[index], used))
+        return jax.tree.map(lambda all, one: all.at[index].set(one), state, _latent(params, config, clouds[index], tip, used))
 
     def add(index, sums):
         return jax.tree.map(lambda sum, all: sum + jnp.where(agreed[index], all[index], 0), sums, (latents, origins))
@@ -145,9 +146,9 @@ def _encode(params, config, clouds, several, size):
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _average(params, config, clouds):
+def _average(params, config, clouds, tip):
     """The same of all points of all clouds, without a loop of unknown length, which has no reverse-mode derivative."""
-    latents, origins = jax.lax.map(lambda points: _latent(params, config, points), clouds)
+    latents, origins = jax.lax.map(lambda points: _latent(params, config, points, tip), clouds)
     agreed = agreeing(jax.lax.stop_gradient(latents), jnp.ones(len(clouds), bool))
     latent, origin = (jnp.mean(all, axis=0, where=agreed[:, *[None] * (all.ndim - 1)]) for all in (latents, origins))
     return DescriptorField(condition(params, config, latent), origin)
@@ -181,10 +182,10 @@ def agreeing(latents: Float[Array, "thinnings latent 3"], used: Bool[Array, "thi
     return agree[jnp.argmax(jnp.sum(agree, axis=1))]
 
 
-def _latent(params, config, points, used=None):
-    """Latent and origin of a cloud, or of the part of it that is used."""
+def _latent(params, config, points, tip, used=None):
+    """Latent and origin of a cloud with a farthest point `tip`, or of the part of it that is used."""
     origin = jnp.mean(points, axis=0, where=None if used is None else used[:, None])
     # A cloud that was centred in float32 has a mean of about 1e-9 m left. Centring it again in float64 moves the latent by 1e-6
     # of its length, so it counts as centred: parity with the original, which leaves centring to the caller, is then exact.
     origin = jnp.where(jnp.max(jnp.abs(origin)) <= CENTRED * jnp.max(jnp.ptp(points, axis=0)), 0.0, origin)
-    return encode_latent(params, config, points - origin, used), origin
+    return encode_latent(params, config, points - origin, used, tip - origin), origin

@@ -43,6 +43,8 @@ class NetworkConfig:
         neighbours: nearest neighbours of an edge feature, the point itself included.
         slope: negative slope of the encoder's vector leaky ReLUs and of the decoder's last activation.
         scaling: factor on all coordinates before the network; the network's unit is 0.1 m.
+        asymmetry: the encoder sees a cloud displaced by this share of the vector from its mean to its farthest point, away from that point; 0 as published. What a rotation leaves
+            as it is, an equivariant network shows as a figure of revolution; displaced, a square bowl has a side to begin at.
     """
 
     latent: int = 256
@@ -53,6 +55,7 @@ class NetworkConfig:
     neighbours: int = 20
     slope: float = 0.2
     scaling: float = 10.0
+    asymmetry: float = 0.0
 
     @property
     def channels(self) -> int:
@@ -190,6 +193,12 @@ def nearest_neighbours(points: Float[Array, "points 3"], count: int, used: Bool[
     return jax.lax.map(nearest, points, batch_size=NEIGHBOUR_ROWS)
 
 
+def farthest(points: Float[Array, "points 3"], used: Bool[Array, "points"] | None = None) -> Float[Array, "3"]:
+    """The point of a centred cloud, or of those used, that is farthest from its mean."""
+    squared = jnp.sum(points**2, axis=1)
+    return points[jnp.argmax(squared if used is None else jnp.where(used, squared, -1))]
+
+
 class VectorResidualBlock(nn.Module):
     """`shortcut(x) + fc_1(act_1(fc_0(act_0(x))))` on vector channels."""
 
@@ -239,7 +248,11 @@ class Encoder(nn.Module):
         self.actvn_c = VectorLeakyReLU(hidden, config.slope)
         self.fc_c = VectorLinear(hidden, config.latent)
 
-    def __call__(self, points: Float[Array, "points 3"], used: Bool[Array, "points"] | None = None) -> Float[Array, "latent 3"]:
+    def __call__(
+        self, points: Float[Array, "points 3"], used: Bool[Array, "points"] | None = None, tip: Float[Array, "3"] | None = None
+    ) -> Float[Array, "latent 3"]:
+        if self.config.asymmetry:
+            points = points - self.config.asymmetry * (farthest(points, used) if tip is None else tip)
         where = None if used is None else used[:, None]
         x, pooled = self.fc_pos(self.conv_pos(points * self.config.scaling, used)), None
         for index in range(self.config.blocks):
@@ -338,18 +351,32 @@ class OccupancyNetwork(nn.Module):
         """Args: points, centred, in metres."""
         return self.decoder(self.encoder(points))
 
-    def encode_latent(self, points: Float[Array, "points 3"], used: Bool[Array, "points"] | None = None) -> Float[Array, "latent 3"]:
-        return self.encoder(points, used)
+    def encode_latent(
+        self, points: Float[Array, "points 3"], used: Bool[Array, "points"] | None = None, tip: Float[Array, "3"] | None = None
+    ) -> Float[Array, "latent 3"]:
+        return self.encoder(points, used, tip)
 
     def condition(self, latent: Float[Array, "latent 3"]) -> Conditioned:
         return self.decoder(latent)
 
 
 def encode_latent(
-    params, config: NetworkConfig, points: Float[Array, "points 3"], used: Bool[Array, "points"] | None = None
+    params,
+    config: NetworkConfig,
+    points: Float[Array, "points 3"],
+    used: Bool[Array, "points"] | None = None,
+    tip: Float[Array, "3"] | None = None,
 ) -> Float[Array, "latent 3"]:
-    """The latent z of a cloud centred on its mean, in metres; of a part of its points where `used` says which."""
-    return OccupancyNetwork(config).apply({"params": params}, points, used, method="encode_latent")
+    """The latent z of a cloud.
+
+    Args:
+        params: of the network.
+        config: its sizes.
+        points: centred on their mean, metres.
+        used: which of them count; all by default.
+        tip: where `config.asymmetry` takes the farthest point to be, relative to the mean; by default the farthest of those that count.
+    """
+    return OccupancyNetwork(config).apply({"params": params}, points, used, tip, method="encode_latent")
 
 
 def condition(params, config: NetworkConfig, latent: Float[Array, "latent 3"]) -> Conditioned:

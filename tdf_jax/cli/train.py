@@ -10,6 +10,7 @@ import tyro
 from tdf_jax.checkpoint import SUFFIX, load_model, save_model
 from tdf_jax.errors import InputError
 from tdf_jax.model import Model, ModelInfo
+from tdf_jax.training.ahead import usual_workers
 from tdf_jax.training.config import TrainConfig
 from tdf_jax.training.dataset import Recipe, build, joined, load
 from tdf_jax.training.loop import steps_within, train as run
@@ -28,6 +29,9 @@ def train(
     weights: Annotated[
         Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=f"(default: OUT/weights{SUFFIX})")
     ] = None,
+    workers: Annotated[
+        int, tyro.conf.arg(help_behavior_hint="(default: a thread on a CPU, one for every core beside an accelerator)")
+    ] = 0,
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = TrainConfig(),
 ) -> None:
     """Train a network on labelled objects, or go on where the run in a folder stands.
@@ -38,6 +42,7 @@ def train(
         start_from: a name of shipped weights or a .safetensors file to go on from; --learning-rate 0.003 suits it.
         minutes: choose --steps so that the run takes about so long on this machine.
         weights: .safetensors file to write at the end.
+        workers: processes that draw the samples of the steps to come.
         config: settings of the run.
     """
     from tdf_jax.viz.curves import training_figure
@@ -46,9 +51,15 @@ def train(
     target = _target(out, weights)
     if minutes is not None and not 0 < minutes < float("inf"):
         raise InputError(f"tdf train: --minutes is {minutes}; expected a positive number")
+    if workers < 0:
+        raise InputError(f"tdf train: --workers is {workers}; expected 1 or more, or 0 for as many as suit this machine")
     model = None if start_from is None else load_model(start_from)
-    if model is not None and model.config != config.network:
-        raise InputError(f"tdf train: --start-from {start_from} is a network of other sizes ({model.config}); expected {config.network}")
+    if model is not None:
+        # Asymmetry is no size: a network may go on with another, and keeps its own where none is asked for.
+        network = dataclasses.replace(model.config, asymmetry=config.network.asymmetry)
+        if network != config.network:
+            raise InputError(f"tdf train: --start-from {start_from} is a network of other sizes ({model.config}); expected {config.network}")
+        config = dataclasses.replace(config, network=network if network.asymmetry else model.config)
     if not data:
         data = (out / "data",)
         build(Recipe(seed=config.seed), data[0], os.cpu_count() or 1)
@@ -58,7 +69,7 @@ def train(
         # A run that stands keeps its steps: they are what its learning rate follows.
         steps = steps_within(minutes, config, objects) if before is None else before["steps"]
         config = dataclasses.replace(config, steps=steps)
-    params = run(config, objects, validation, out, initial=None if model is None else model.params)
+    params = run(config, objects, validation, out, initial=None if model is None else model.params, workers=workers or usual_workers())
     save_figure(out / "training.png", training_figure(metrics(out)))
     origin = "" if start_from is None else f" from {start_from}"
     source = f"tdf train, {config.steps} steps{origin}, seed {config.seed}"

@@ -84,17 +84,20 @@ def draw(
         diagonal = _log_uniform(rng, USUAL_DIAGONALS if rng.uniform() < 0.5 else DIAGONALS)
         samples = []
         for which in range(2):
-            if which == 0:  # all sources alike, however many objects they have
-                among = data.sources[rng.integers(len(data.sources)) if len(data.sources) > 1 else 0]
-            else:  # a partner of the same kind: places mean the same on both, and what leaves one as it is leaves the other
-                among = data.kinds[data.kind[index]]
-            index = among[rng.integers(len(among))]
+            if which == 0:  # all sources alike, and all kinds of one, however many objects they have
+                kind = _one_of(rng, _one_of(rng, data.sources))
+            # A partner is of the same kind: places mean the same on both, and what leaves one as it is leaves the other.
+            index = data.kinds[kind][rng.integers(len(data.kinds[kind]))]
             cloud = thin(_sensed(data, rng, index, corruption, points), points)
             chosen = rng.integers(data.queries.shape[1], size=queries)
             size = diagonal * math.exp(rng.uniform(-PAIR_SPREAD, PAIR_SPREAD))
             samples.append(_sample(data, index, cloud, chosen, size))
         drawn.append(_pair(rng, samples, diagonal, box, poses))
     return Batch(*(np.stack(column).astype(np.float32) for column in zip(*drawn)))
+
+
+def _one_of(rng, choices):
+    return choices[rng.integers(len(choices)) if len(choices) > 1 else 0]
 
 
 def _sensed(data, rng, index, corruption, points):

@@ -56,5 +56,7 @@ class TrainConfig:
             raise InputError(f"TrainConfig(): learning_rate is {self.learning_rate}; expected a positive number")
         if not 0 <= self.corruption <= 1:
             raise InputError(f"TrainConfig(): corruption is {self.corruption}; expected 0 to 1")
+        if not 0 <= self.network.asymmetry < 1:
+            raise InputError(f"TrainConfig(): network.asymmetry is {self.network.asymmetry}; expected 0 to less than 1")
         if not self.save_seconds >= 0:
             raise InputError(f"TrainConfig(): save_seconds is {self.save_seconds}; expected 0 or more")

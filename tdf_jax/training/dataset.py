@@ -107,9 +107,10 @@ class DataSet:
         return slice(0, int(self.queries.shape[1] * UNIFORM_SHARE))
 
     @cached_property
-    def sources(self) -> list[Int[np.ndarray, " members"]]:
-        """Indices of the objects of each source."""
-        return [np.flatnonzero(self.source == source) for source in np.unique(self.source)]
+    def sources(self) -> list[list[int]]:
+        """Of each source, the numbers of its kinds in `kinds`."""
+        source = [self.source[members[0]] for members in self.kinds]
+        return [np.flatnonzero(source == one).tolist() for one in np.unique(source)]
 
     @cached_property
     def kinds(self) -> list[Int[np.ndarray, " members"]]:

@@ -1,6 +1,5 @@
 """The training loop: deterministic, and resumable to the same numbers."""
 
-import concurrent.futures
 import dataclasses
 import functools
 import hashlib
@@ -20,6 +19,7 @@ from tdf_jax.evaluation.transfer import place_errors, transferred
 from tdf_jax.model import Model, ModelInfo
 from tdf_jax.network import encode_latent, initialise
 from tdf_jax.optimize import OptimizeConfig
+from tdf_jax.training.ahead import drawn_ahead
 from tdf_jax.training.batch import VALIDATION_DIAGONAL, Batch, draw, validation_pairs
 from tdf_jax.training.config import TrainConfig
 from tdf_jax.training.dataset import DataSet
@@ -40,6 +40,7 @@ def train(
     directory: str | Path,
     initial: dict | None = None,
     progress: bool = True,
+    workers: int = 1,
 ) -> dict:
     """Train, or resume where the checkpoint in `directory` stands, to `config.steps`.
 
@@ -54,6 +55,7 @@ def train(
         initial: parameters of a network to go on from; random ones by default. Clouds then are as sensors give them from the first
             step: a network that knew one view unlearned it while clouds were complete (IoU 0.48 to 0.08 in 500 steps).
         progress: show a progress bar.
+        workers: processes that draw batches, which do not depend on how many there are; 1 is a thread of this one.
 
     Returns:
         The network's parameters, averaged over about the last tenth of the steps, as validation measures them: at a high learning rate
@@ -85,13 +87,11 @@ def train(
     drop_later_metrics(directory, start)
 
     saved = began = time.monotonic()
-    batch = functools.partial(_batch, config, data, gradual=initial is None)
-    with concurrent.futures.ThreadPoolExecutor(1) as pool, (directory / METRICS).open("a") as metrics:
-        upcoming = pool.submit(batch, start)
+    batch = functools.partial(batch_of, config, gradual=initial is None)
+    with drawn_ahead(batch, data, start, workers) as batches, (directory / METRICS).open("a") as metrics:
         bar = tqdm(range(start, config.steps), initial=start, total=config.steps, desc="training", disable=not progress)
         for step in bar:
-            samples, upcoming = upcoming.result(), pool.submit(batch, step + 1)
-            params, state, parts = _step(params, state, dataclasses.astuple(samples), step, config.network, optimiser)
+            params, state, parts = _step(params, state, dataclasses.astuple(next(batches)), step, config.network, optimiser)
             row = {"step": step + 1, "seconds": round(time.monotonic() - began, 2)} | summary(parts)
             bar.set_postfix({name: f"{row[name]:.3f}" for name in ("bce", "frame", "place", "iou")})
             done = step + 1 == config.steps
@@ -123,7 +123,7 @@ def steps_within(minutes: float, config: TrainConfig, data: DataSet) -> int:
     times = []
     for step in range(TIMED_STEPS):
         began = time.monotonic()
-        params, state, _ = _step(params, state, dataclasses.astuple(_batch(config, data, step)), step, config.network, optimiser)
+        params, state, _ = _step(params, state, dataclasses.astuple(batch_of(config, data, step)), step, config.network, optimiser)
         jax.block_until_ready(params)
         times.append(time.monotonic() - began)
     seconds = float(np.median(times[1:]))  # the first compiles
@@ -153,12 +153,6 @@ def _at_size(T_object_place):
     T = T_object_place.astype(float)
     T[:3, 3] *= VALIDATION_DIAGONAL
     return T
-
-
-def _batch(config, data, step, gradual=True):
-    corruption = config.corruption * (np.interp(step / config.steps, CORRUPTING, (0, 1)) if gradual else 1)
-    rng = np.random.default_rng([config.seed, 1, step])
-    return draw(data, rng, config.batch // 2, config.points, config.queries, corruption, config.box, config.poses)
 
 
 def _digest(initial):
@@ -220,6 +214,13 @@ def _optimiser(config: TrainConfig) -> optax.GradientTransformation:
         adam_learning_rate=lambda step: config.learning_rate / 6 * schedule(step),
         muon_weight_dimension_numbers=matrices,
     )
+
+
+def batch_of(config: TrainConfig, data: DataSet, step: int, gradual: bool = True) -> Batch:
+    """The batch of one step: a function of the seed and the step."""
+    corruption = config.corruption * (np.interp(step / config.steps, CORRUPTING, (0, 1)) if gradual else 1)
+    rng = np.random.default_rng([config.seed, 1, step])
+    return draw(data, rng, config.batch // 2, config.points, config.queries, corruption, config.box, config.poses)
 
 
 def _start(config, data, optimiser, initial):

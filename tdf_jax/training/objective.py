@@ -1,10 +1,13 @@
 """What training minimises: occupancy, the frame the latent must carry, and descriptors that agree at an object's places."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
+from tdf_jax.devices import one_at_a_time
 from tdf_jax.field import DescriptorField
 from tdf_jax.network import NetworkConfig, condition, decode, encode_latent
 
@@ -42,10 +45,15 @@ def pair_loss(
     Returns:
         The loss, and its parts by name, one of each object.
     """
-    fields, losses, parts = jax.lax.map(lambda sample: _object_loss(params, config, *sample), (clouds, queries, inside, centres, fold))
+    fields, losses, parts = _each(functools.partial(_object_loss, params, config), clouds, queries, inside, centres, fold)
     others = jax.tree.map(lambda leaf: leaf[::-1], fields)
-    place = jax.lax.map(lambda sample: place_error(*sample), (fields, others, shown, offered))
+    place = _each(place_error, fields, others, shown, offered)
     return jnp.mean(losses) + PLACE_WEIGHT * jnp.mean(place), parts | {"place": place}
+
+
+def _each(function, *samples):
+    """`function` of the samples of every object."""
+    return jax.lax.map(lambda sample: function(*sample), samples) if one_at_a_time() else jax.vmap(function)(*samples)
 
 
 def _object_loss(params, config, cloud, queries, inside, centre, fold):
@@ -109,15 +117,21 @@ def place_error(
 
 
 def mean_gradient(params, config: NetworkConfig, *samples):
-    """Loss parts and gradients averaged over a batch, one pair of objects after the other.
+    """Gradients averaged over a batch of pairs of objects, and the loss and its parts of each.
 
-    A scan that adds up gradients holds one pair's activations at a time, and is faster on a CPU than `vmap`.
+    On a CPU one pair after the other: a scan that adds up gradients holds one pair's activations at a time, and is faster there than `vmap`.
     """
 
     def add(total, sample):
         (loss, parts), gradient = jax.value_and_grad(pair_loss, has_aux=True)(params, config, *sample)
         return jax.tree.map(jnp.add, total, gradient), {"loss": loss, **parts}
 
-    zero = jax.tree.map(jnp.zeros_like, params)
-    total, parts = jax.lax.scan(add, zero, samples)
-    return jax.tree.map(lambda leaf: leaf / len(samples[0]), total), parts
+    if one_at_a_time():
+        total, parts = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, params), samples)
+        return jax.tree.map(lambda leaf: leaf / len(samples[0]), total), parts
+
+    def mean_loss(params):
+        losses, parts = jax.vmap(lambda *sample: pair_loss(params, config, *sample))(*samples)
+        return jnp.mean(losses), {"loss": losses, **parts}
+
+    return jax.grad(mean_loss, has_aux=True)(params)
