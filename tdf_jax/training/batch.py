@@ -37,6 +37,7 @@ GLOBAL_SHARE = 0.4  # of the wrong poses: any rotation, any position about the o
 GLOBAL_SPREAD = 0.35  # standard deviation of the position, of the diagonal
 NEAR_ANGLES = (3.0, 90.0)  # degrees, log-uniform
 NEAR_DISTANCES = (0.01, 0.3)  # of the pair's diagonal, log-uniform
+QUARTERS = 4  # turns about the axis that are tried for a symmetric object's equal poses: the most that one with several fronts has
 LEAST_WRONG = 0.01  # of the pair's diagonal: root mean square distance of query points from where a symmetric object's right poses have them
 
 
@@ -51,7 +52,7 @@ class Batch:
         fold: symmetry of the objects, see `tdf_jax.symmetry`: it tells which of the frame's axes there are.
         shown: query points at a place of each object, relative to its mean.
         offered: the same query points on the pair's other object, relative to that one's mean: first where the place has
-            them there, then at wrong poses.
+            them there, at `QUARTERS` poses that the object's symmetry makes equal, some of them the same, then at wrong poses.
     """
 
     clouds: Float[np.ndarray, "pairs 2 points 3"]
@@ -60,7 +61,7 @@ class Batch:
     centres: Float[np.ndarray, "pairs 2 3"]
     fold: Float[np.ndarray, "pairs 2"]
     shown: Float[np.ndarray, "pairs 2 box 3"]
-    offered: Float[np.ndarray, "pairs 2 poses box 3"]
+    offered: Float[np.ndarray, "pairs 2 offers box 3"]
 
 
 def draw(
@@ -77,7 +78,7 @@ def draw(
         queries: labelled points of every object.
         corruption: how far clouds have come from complete ones (0) to what sensors give (1).
         box: query points of a place.
-        poses: poses they are offered at, the right one included.
+        poses: poses they are offered at, the right one, with its equals, counted once.
     """
     drawn = []
     for _ in range(pairs):
@@ -171,9 +172,17 @@ def _pair(rng, samples, diagonal, box, poses):
         shown.append(_apply(a.places[place] @ T_place_query, x))
         right = b.places[place] @ T_place_query
         wrong = [_unlike(rng, right, diagonal, x, b) for _ in range(poses - 1)]
-        offered.append([_apply(T, x) for T in (right, *wrong)])
+        offered.append([_apply(T, x) for T in (*_equals(right, b), *wrong)])
     fields = (np.stack([getattr(sample, name) for sample in samples]) for name in ("cloud", "queries", "inside", "centre", "fold"))
     return *fields, shown, offered
+
+
+def _equals(right, target):
+    """The right pose after each quarter turn about the target's axis that its symmetry allows, and as it is in place of the others."""
+    T_mean_object = np.eye(4)
+    T_mean_object[:3, 3] = target.centre
+    turned = [T_mean_object @ about_z(quarter * np.pi / 2) @ np.linalg.inv(T_mean_object) @ right for quarter in range(QUARTERS)]
+    return [turned[quarter if quarter * target.fold % QUARTERS == 0 else 0] for quarter in range(QUARTERS)]
 
 
 def _unlike(rng, right, diagonal, x, target):

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from tdf_jax.devices import one_at_a_time
 from tdf_jax.field import DescriptorField
 from tdf_jax.network import NetworkConfig, condition, decode, encode_latent
+from tdf_jax.training.batch import QUARTERS
 
 FRAME_WEIGHT = 0.3
 PLACE_WEIGHT = 0.1
@@ -28,7 +29,7 @@ def pair_loss(
     centres: Float[Array, "2 3"],
     fold: Float[Array, "2"],
     shown: Float[Array, "2 box 3"],
-    offered: Float[Array, "2 poses box 3"],
+    offered: Float[Array, "2 offers box 3"],
 ) -> tuple[Float[Array, ""], dict]:
     """Loss of a pair of objects: occupancy, `FRAME_WEIGHT` times the frame's error, `PLACE_WEIGHT` times the places'.
 
@@ -94,9 +95,9 @@ def frame_error(
         fold: symmetry of the object; a round one is asked for no front.
     """
     up, front, origin = params["frame"].T @ latent
-    turns = jnp.arange(4)
+    turns = jnp.arange(QUARTERS)
     fronts = jnp.round(jnp.stack([jnp.cos(turns * jnp.pi / 2), jnp.sin(turns * jnp.pi / 2), 0 * turns], axis=1))
-    misses = jnp.where(turns * fold % 4 == 0, jnp.sum((front - fronts) ** 2, axis=1), jnp.inf)
+    misses = jnp.where(turns * fold % QUARTERS == 0, jnp.sum((front - fronts) ** 2, axis=1), jnp.inf)
     return jnp.sum((up - jnp.asarray(UP)) ** 2) + jnp.where(fold > 0, jnp.min(misses), 0) + jnp.sum((origin - centre) ** 2)
 
 
@@ -104,15 +105,17 @@ def place_error(
     shown_on: DescriptorField,
     offered_to: DescriptorField,
     shown: Float[Array, "box 3"],
-    offered: Float[Array, "poses box 3"],
+    offered: Float[Array, "offers box 3"],
 ) -> Float[Array, ""]:
     """How badly the descriptors shown at a place of one object choose the same place of another among wrong poses.
 
     With E_k the descriptor loss (eq. 2) of pose k, the right one first: -log(E_0^-s / sum_k E_k^-s), s = `SHARPNESS`. It asks of
-    the energy what imitation asks of it, that its minimum lie at the right pose, and does not depend on the energy's unit.
+    the energy what imitation asks of it, that its minimum lie at the right pose, and does not depend on the energy's unit. A symmetric object has several right poses, and its
+    network takes one of its fronts for the front: the best of them counts.
     """
     reference = shown_on.descriptors(shown)
     energy = jnp.mean(jnp.abs(offered_to.descriptors(offered) - reference), axis=(1, 2))
+    energy = jnp.concatenate([jnp.min(energy[:QUARTERS], keepdims=True), energy[QUARTERS:]])
     return optax.softmax_cross_entropy_with_integer_labels(-SHARPNESS * jnp.log(energy), jnp.int32(0))
 
 
