@@ -95,8 +95,8 @@ def encode(model: Model, points: Float[Array, "points 3"], thinnings: int = THIN
         thinnings: how many are averaged, see `pointcloud.thinnings`; 0 uses all points as they are.
 
     Returns:
-        The field, in the world frame; it moves and turns with the points, exactly where they are used as they are, and otherwise but for ties
-        in thinning that rounding decides.
+        The field, in the world frame; it moves and turns with the points, exactly where they are used as they are by a network without asymmetry, and otherwise but for ties
+        that rounding decides: in thinning, and which point is the farthest from the mean.
 
     Raises:
         InputError: the points are fewer than 21 or than the network's neighbours, not (points, 3), not finite or all equal; thinnings is negative, or the points would
@@ -110,13 +110,14 @@ def encode(model: Model, points: Float[Array, "points 3"], thinnings: int = THIN
     plain = not thinnings or count is None
     dense = not plain and len(points) > count
     traced = isinstance(points, jax.core.Tracer)
-    tip = points[((points - points.mean(axis=0)) ** 2).sum(axis=1).argmax()]  # of all points: every thinning is displaced alike
+    whole = points if traced else np.asarray(points)
+    tip = whole[((whole - whole.mean(axis=0)) ** 2).sum(axis=1).argmax()]  # the same for all thinnings, which then take the same side of a symmetric object for its front
     if traced and dense:
         raise InputError(
             f"encode(): {len(points)} points cannot be thinned to {count} under jax.jit; expected that many. "
             "Thin the cloud outside with tdf.thin, or pass thinnings=0"
         )
-    clouds = pointcloud.thinnings(np.asarray(points), count, thinnings) if dense else points[None]
+    clouds = pointcloud.thinnings(whole, count, thinnings) if dense else points[None]
     if traced or any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(model.params)):
         return _average(model.params, model.config, clouds, tip)
     several, size = clouds.shape[:2]

@@ -55,7 +55,7 @@ def test_batches_are_a_function_of_the_generator(objects):
         assert getattr(first, field.name).dtype == np.float32
     assert not np.array_equal(first.clouds, other.clouds)
     shapes = [getattr(first, field.name).shape for field in dataclasses.fields(first)]
-    assert shapes == [(3, 2, 200, 3), (3, 2, 50, 3), (3, 2, 50), (3, 2, 3), (3, 2), (3, 2, 12, 3), (3, 2, 6, 12, 3)]
+    assert shapes == [(3, 2, 200, 3), (3, 2, 50, 3), (3, 2, 50), (3, 2, 3), (3, 2), (3, 2, 12, 3), (3, 2, batch.QUARTERS + 5, 12, 3)]
 
 
 def test_everything_of_an_object_is_scaled_and_centred_together(objects):
@@ -95,7 +95,9 @@ def test_the_right_pose_is_the_same_place_of_the_partner_and_the_others_are_not(
             other_place[:3, 3] = other_place[:3, 3] * other_size + partner["centres"]
             expected.append(other_place @ np.linalg.inv(place))
         assert min(np.abs(T - motion).max() for motion in expected) < 0.01
-        for wrong in sample["offered"][1:]:
+        for equal in sample["offered"][1 : batch.QUARTERS]:  # of an object without symmetry there is one right pose
+            np.testing.assert_array_equal(equal, sample["offered"][0])
+        for wrong in sample["offered"][batch.QUARTERS :]:
             assert rigid(sample["shown"], wrong)[1] < 1e-5
             moved = np.linalg.norm(wrong - sample["offered"][0], axis=-1).max()
             assert moved > 0.003 * size
@@ -180,6 +182,29 @@ def test_partners_are_of_the_same_source_and_symmetry(objects, monkeypatch):
     np.testing.assert_array_equal(made.fold, np.array(folds)[found])
 
 
+def test_kinds_of_a_source_are_drawn_alike_however_many_objects_they_have(objects, monkeypatch):
+    data = many(objects, [0] * 9 + [2] + [4] * 2 + [1] * 3, [0] * 12 + [1] * 3)
+    found, _ = drawn_indices(data, monkeypatch, 600)
+    numbers = np.bincount(data.kind[found[:, 0]]) / 600
+    expected = [1 / 2 if (data.source[members] == 1).all() else 1 / 6 for members in data.kinds]
+    np.testing.assert_allclose(numbers, expected, atol=0.07)  # four standard deviations
+
+
+@pytest.mark.parametrize(("fold", "turns"), [(0, (0, 90, 180, 270)), (1, (0, 0, 0, 0)), (2, (0, 0, 180, 0)), (4, (0, 90, 180, 270))])
+def test_the_right_pose_is_offered_at_every_quarter_turn_that_a_symmetry_allows(objects, fold, turns):
+    """About the object's own axis, which a cloud seen from one side does not have its mean on."""
+    data = many(objects, [fold] * 3, [0] * 3)
+    off_axis = 0.0
+    for sample, partner in pairs_of(drawn(data, 3, corruption=1.0, pairs=6)):
+        centre = partner["centres"].astype(float)
+        off_axis = max(off_axis, np.linalg.norm(centre[:2]))
+        right = sample["offered"][0].astype(float)
+        for turn, offered in zip(turns, sample["offered"][: batch.QUARTERS], strict=True):
+            expected = Rotation.from_euler("z", turn, degrees=True).apply(right - centre) + centre
+            np.testing.assert_allclose(offered, expected, atol=1e-6)
+    assert off_axis > 0.01
+
+
 @pytest.fixture
 def diagonal(monkeypatch):
     """Of every pair, metres."""
@@ -214,7 +239,7 @@ def test_wrong_poses_are_wrong_for_every_turn_a_symmetry_allows(objects, diagona
     bases = dataclasses.replace(many(objects, [fold] * 3, [0] * 3), places=objects.places[:, [0, 2, 2]])
     found = []
     for sample, partner in pairs_of(drawn(bases, 1, pairs=12, poses=5)):
-        right, *wrong = sample["offered"].astype(float)
+        right, wrong = sample["offered"][0].astype(float), sample["offered"][batch.QUARTERS :].astype(float)
         found += [least_distance(one, right, partner["centres"], fold) for one in wrong]
     assert np.min(found) > batch.LEAST_WRONG * diagonal - 1e-4
     assert set(offered_turns) == {0, 90, 135, 180, 225}
@@ -229,7 +254,7 @@ def test_wrong_poses_as_training_draws_them_are_wrong_for_every_turn(objects, di
     found = [
         least_distance(wrong.astype(float), sample["offered"][0].astype(float), partner["centres"], fold)
         for sample, partner in pairs_of(drawn(data, 2, pairs=12, poses=12))
-        for wrong in sample["offered"][1:]
+        for wrong in sample["offered"][batch.QUARTERS :]
     ]
     assert np.min(found) > batch.LEAST_WRONG * diagonal - 1e-5
     assert np.mean(np.array(found) < 0.1 * diagonal) > 0.05  # not only far ones

@@ -15,7 +15,7 @@ from tdf_jax.errors import InputError
 from tdf_jax.model import Model, ModelInfo
 from tdf_jax.network import NetworkConfig, parameter_shapes
 
-CONFIG = NetworkConfig(latent=2, vector_hidden=3, vector_width=6, decoder_width=4, blocks=1, neighbours=3, scaling=7.5)
+CONFIG = NetworkConfig(latent=2, vector_hidden=3, vector_width=6, decoder_width=4, blocks=1, neighbours=3, scaling=7.5, asymmetry=0.1)
 
 
 def make_model(**info):
@@ -64,6 +64,12 @@ def test_a_model_survives_the_file(saved):
     for before, after in zip(jax.tree.leaves(model.params), jax.tree.leaves(loaded.params), strict=True):
         assert isinstance(after, jax.Array) and after.dtype == jnp.float32
         np.testing.assert_array_equal(before, after)
+
+
+def test_a_file_from_before_there_was_asymmetry_has_none(saved):
+    before = {name: value for name, value in dataclasses.asdict(CONFIG).items() if name != "asymmetry"}
+    rewrite(saved, header={"config": before}, checksum=True)
+    assert load_model(saved).config == dataclasses.replace(CONFIG, asymmetry=0.0)
 
 
 def test_unknown_cloud_points_and_whole_number_scaling_survive(tmp_path):

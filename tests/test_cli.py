@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import tdf_jax as tdf
+from tdf_jax.checkpoint import load_model, save_model
 from tdf_jax.cli import main as command_line, report, scene
 from tdf_jax.cli.main import main
 from tdf_jax.cli.settings import Settings
@@ -481,6 +482,39 @@ def test_train_refuses_unwritable_places_before_training(refusal, tmp_path, monk
     (tmp_path / "run").mkdir()
     for place in (tmp_path / "mug.npz", tmp_path / "missing" / "mug.safetensors"):
         check(refusal("train", "--out", tmp_path / "run", "--weights", place), "^tdf: error: tdf train: --weights is")
+
+
+def test_train_refuses_bad_numbers_before_training(refusal, tmp_path, monkeypatch):
+    monkeypatch.setattr("tdf_jax.cli.train.run", lambda *_: pytest.fail("the work has begun"))
+    check(refusal("train", "--out", tmp_path / "run", "--workers", -1), "^tdf: error: tdf train: --workers is -1; expected 1 or more, or 0")
+    check(refusal("train", "--out", tmp_path / "run", "--network.asymmetry", 1), "network.asymmetry is 1.0; expected 0 to less than 1")
+
+
+@pytest.mark.parametrize(("given", "asked", "trained"), [(0.0, None, 0.0), (0.2, None, 0.2), (0.0, 0.1, 0.1), (0.2, 0.1, 0.1)])
+def test_a_run_keeps_the_asymmetry_of_the_weights_it_goes_on_from_unless_another_is_asked_for(
+    given, asked, trained, weights, tmp_path, monkeypatch, capsys
+):
+    model = load_model(weights)
+    start = tmp_path / "start.safetensors"
+    save_model(dataclasses.replace(model, config=dataclasses.replace(model.config, asymmetry=given)), start)
+    runs = []
+
+    def trained_as(config, *_, initial, workers):
+        runs.append((config.network, workers))
+        return initial
+
+    monkeypatch.setattr("tdf_jax.cli.train.run", trained_as)
+    monkeypatch.setattr("tdf_jax.cli.train.load", lambda _: (None, None))
+    monkeypatch.setattr("tdf_jax.cli.train.joined", lambda sets: sets[0])
+    monkeypatch.setattr("tdf_jax.viz.curves.training_figure", lambda _: None)
+    monkeypatch.setattr("tdf_jax.viz.style.save_figure", lambda *_: None)
+    sizes = {name: getattr(model.config, name) for name in ("latent", "vector_hidden", "vector_width", "decoder_width", "blocks")}
+    options = [word for name, size in sizes.items() for word in (f"--network.{name.replace('_', '-')}", size)]
+    options += [] if asked is None else ["--network.asymmetry", asked]
+    run("train", "--out", tmp_path / "run", "--data", tmp_path, "--start-from", start, *options, "--workers", 3)
+    expected = dataclasses.replace(model.config, asymmetry=trained)
+    assert runs == [(expected, 3)]
+    assert load_model(tmp_path / "run" / "weights.safetensors").config == expected
 
 
 # Evaluation

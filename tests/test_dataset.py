@@ -317,7 +317,8 @@ def some(folds, sources=None, places=3, seed=0):
 
 def test_kinds_are_of_one_source_and_symmetry_and_pairs_of_one_kind():
     data = some([0, 4, 0, 2, 0, 4, 0, 1], sources=[0, 0, 0, 0, 1, 1, 1, 1])
-    assert [members.tolist() for members in data.sources] == [[0, 1, 2, 3], [4, 5, 6, 7]]
+    of_sources = [sorted(index for kind in kinds for index in data.kinds[kind].tolist()) for kinds in data.sources]
+    assert of_sources == [[0, 1, 2, 3], [4, 5, 6, 7]]
     assert sorted(members.tolist() for members in data.kinds) == [[0, 2], [1], [3], [4, 6], [5], [7]]
     for index, number in enumerate(data.kind):
         assert index in data.kinds[number]

@@ -141,6 +141,59 @@ def test_a_dense_cloud_is_thinned_several_times_and_the_latents_averaged(small_m
     np.testing.assert_allclose(found.origin, np.mean([field.origin for field in fields], axis=0, where=agreed[:, None]), atol=1e-7)
 
 
+@pytest.fixture(scope="module")
+def displacing_model(thinning_model):
+    """It sees clouds of 24 points, displaced."""
+    return dataclasses.replace(thinning_model, config=dataclasses.replace(thinning_model.config, asymmetry=0.2))
+
+
+def test_a_displaced_cloud_is_seen_away_from_its_farthest_point(small_model, displacing_model):
+    """All thinnings alike, by the farthest point of the whole cloud; where the field is, is not displaced."""
+    points = random_cloud(0, 90).astype(np.float32)
+    tip = points[np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1))]
+    clouds = thinnings(points, 24, 4)
+    latents = []
+    for cloud in clouds:
+        centred = cloud - cloud.mean(axis=0)
+        latents.append(np.asarray(encode_latent(small_model.params, small_model.config, centred - 0.2 * (tip - cloud.mean(axis=0)))))
+    plain = np.stack([tdf.encode(small_model, cloud).latent for cloud in clouds])
+    assert np.abs(np.stack(latents) - plain).max() > 1e-2 * np.abs(plain).max()
+    agreed = np.asarray(agreeing(jnp.asarray(latents), np.ones(4, bool)))
+    found = tdf.encode(displacing_model, points, thinnings=4)
+    np.testing.assert_allclose(found.latent, np.mean(latents, axis=0, where=agreed[:, None, None]), atol=1e-5)
+    np.testing.assert_allclose(found.origin, clouds[agreed].mean(axis=(0, 1)), atol=1e-6)
+    # Of a sparse cloud, filled up with points that do not count, the same as of the points alone, under jax.jit too.
+    few = points[:22]
+    centred = few - few.mean(axis=0)
+    alone = encode_latent(small_model.params, displacing_model.config, centred)
+    farthest = centred[np.argmax(np.linalg.norm(centred, axis=1))]
+    np.testing.assert_allclose(alone, encode_latent(small_model.params, small_model.config, centred - 0.2 * farthest), atol=1e-5)
+    for field in (tdf.encode(displacing_model, few), jax.jit(lambda points: tdf.encode(displacing_model, points))(few)):
+        np.testing.assert_allclose(field.latent, alone, atol=1e-5)
+        np.testing.assert_allclose(field.origin, few.mean(axis=0), atol=1e-7)
+
+
+def test_a_displaced_field_moves_and_turns_with_its_cloud(displacing_model):
+    points = random_cloud(0, 90)
+    R = Rotation.random(random_state=0).as_matrix()
+    still, moved = (tdf.encode(displacing_model, cloud.astype(np.float32)) for cloud in (points, points @ R.T + 0.3))
+    np.testing.assert_allclose(moved.latent, still.latent @ R.T, atol=1e-4)
+    np.testing.assert_allclose(moved.origin, R @ still.origin + 0.3, atol=1e-6)
+
+
+def test_a_symmetric_object_has_sides_to_a_network_with_asymmetry_only(small_model, displacing_model):
+    """A cloud that half a turn leaves as it is: without, all of its latent lies along the axis."""
+    half = random_cloud(1, 12) - random_cloud(1, 12).mean(axis=0)
+    points = np.concatenate([half, half * (-1, -1, 1)])
+    points -= points.mean(axis=0)
+    shares = []
+    for config in (small_model.config, displacing_model.config):
+        latent = np.asarray(encode_latent(small_model.params, config, points.astype(np.float32)))
+        shares.append(np.sum(latent[:, :2] ** 2) / np.sum(latent**2))
+    assert shares[0] < 1e-8
+    assert shares[1] > 1e-2
+
+
 def noisy(latent, turns, seed):
     """A latent turned about z by degrees, with noise of a tenth."""
     noise = np.random.default_rng(seed).normal(size=(len(turns), *latent.shape)) * 0.1 * np.std(latent)

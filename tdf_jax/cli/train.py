@@ -48,11 +48,11 @@ def train(
     from tdf_jax.viz.curves import training_figure
     from tdf_jax.viz.style import save_figure
 
-    target = _target(out, weights)
     if minutes is not None and not 0 < minutes < float("inf"):
         raise InputError(f"tdf train: --minutes is {minutes}; expected a positive number")
     if workers < 0:
         raise InputError(f"tdf train: --workers is {workers}; expected 1 or more, or 0 for as many as suit this machine")
+    target = _target(out, weights)
     model = None if start_from is None else load_model(start_from)
     if model is not None:
         # Asymmetry is no size: a network may go on with another, and keeps its own where none is asked for.
