@@ -52,6 +52,7 @@ def train(
         raise InputError(f"tdf train: --minutes is {minutes}; expected a positive number")
     if workers < 0:
         raise InputError(f"tdf train: --workers is {workers}; expected 1 or more, or 0 for as many as suit this machine")
+    workers = workers or usual_workers()
     target = _target(out, weights)
     model = None if start_from is None else load_model(start_from)
     if model is not None:
@@ -67,9 +68,9 @@ def train(
     before = settings_of(out)
     if minutes is not None:
         # A run that stands keeps its steps: they are what its learning rate follows.
-        steps = steps_within(minutes, config, objects) if before is None else before["steps"]
+        steps = steps_within(minutes, config, objects, workers) if before is None else before["steps"]
         config = dataclasses.replace(config, steps=steps)
-    params = run(config, objects, validation, out, initial=None if model is None else model.params, workers=workers or usual_workers())
+    params = run(config, objects, validation, out, initial=None if model is None else model.params, workers=workers)
     save_figure(out / "training.png", training_figure(metrics(out)))
     origin = "" if start_from is None else f" from {start_from}"
     source = f"tdf train, {config.steps} steps{origin}, seed {config.seed}"

@@ -108,12 +108,12 @@ def train(
     return state["average"]["network"]
 
 
-def steps_within(minutes: float, config: TrainConfig, data: DataSet) -> int:
+def steps_within(minutes: float, config: TrainConfig, data: DataSet, workers: int = 1) -> int:
     """How many steps a run of so many minutes has time for, from the time of a few on this machine.
 
     Args:
         minutes: for the steps; a tenth is kept for validations.
-        config, data: of the run.
+        config, data, workers: of the run.
 
     Raises:
         InputError: there is no time for more steps than `config.warmup`.
@@ -121,11 +121,12 @@ def steps_within(minutes: float, config: TrainConfig, data: DataSet) -> int:
     optimiser = _optimiser(config)
     params, state = _start(config, data, optimiser, None)
     times = []
-    for step in range(TIMED_STEPS):
-        began = time.monotonic()
-        params, state, _ = _step(params, state, dataclasses.astuple(batch_of(config, data, step)), step, config.network, optimiser)
-        jax.block_until_ready(params)
-        times.append(time.monotonic() - began)
+    with drawn_ahead(functools.partial(batch_of, config), data, 0, workers) as batches:
+        for step in range(TIMED_STEPS):
+            began = time.monotonic()
+            params, state, _ = _step(params, state, dataclasses.astuple(next(batches)), step, config.network, optimiser)
+            jax.block_until_ready(params)
+            times.append(time.monotonic() - began)
     seconds = float(np.median(times[1:]))  # the first compiles
     steps = int(0.9 * 60 * minutes / seconds)
     if steps <= config.warmup:
@@ -228,8 +229,9 @@ def _start(config, data, optimiser, initial):
     centres = samples.centres.reshape(8, 3) * config.network.scaling
     clouds = samples.clouds.reshape(8, config.points, 3)
 
+    @jax.jit  # whole: operation by operation there are hundreds of programs to compile
     def latents(network):
-        return jnp.stack([encode_latent(network, config.network, jnp.asarray(cloud)) for cloud in clouds])
+        return jax.lax.map(lambda cloud: encode_latent(network, config.network, cloud), clouds)
 
     if initial is None:
         network = initialise(jax.random.key(config.seed), config.network)
