@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from tdf_jax import devices, poses
 from tdf_jax.demonstration import Reference
 from tdf_jax.energy import pose_difference
+from tdf_jax.precision import full_precision
 
 LARGEST_TURN, LARGEST_MOVE = 0.7, 0.05  # radians and metres of one step
 DAMPINGS = 1e-3, 1e3  # least and greatest
@@ -97,6 +98,7 @@ def descend(R, place, waypoint, bounds, damping, tolerance, field, problem, ener
     return work(R, place, waypoint, bounds, damping, tolerance, field, problem, energy)
 
 
+@full_precision
 def _steps(R, place, waypoint, bounds, damping, tolerance, field, problem, energy, *, length, chunk, axes):
     """`descend` on one device; `axes` are the mesh's."""
     if axes:

@@ -16,6 +16,7 @@ from tdf_jax.errors import InputError
 from tdf_jax.field import DescriptorField
 from tdf_jax.network import NetworkConfig, condition, encode_latent
 from tdf_jax.pointcloud import check_points
+from tdf_jax.precision import full_precision
 
 CENTRED = 1e-7  # of a cloud's extent: a mean this near zero is float32's rounding
 ROOM = 250  # clouds that are not thinned are filled up to a multiple, which common sizes are already
@@ -155,6 +156,7 @@ def _average(params, config, clouds, tip):
     return DescriptorField(condition(params, config, latent), origin)
 
 
+@full_precision
 def agreeing(latents: Float[Array, "thinnings latent 3"], used: Bool[Array, "thinnings"]) -> Bool[Array, "thinnings"]:
     """Which latents of one object show it in the same of several poses that it cannot be told apart in.
 
@@ -170,7 +172,7 @@ def agreeing(latents: Float[Array, "thinnings latent 3"], used: Bool[Array, "thi
     Source:
         The best rotation is Kabsch's, Acta Crystallographica A, 1976.
     """
-    cross = jnp.einsum("aci,bcj->abij", latents, latents, precision=jax.lax.Precision.HIGHEST)
+    cross = jnp.einsum("aci,bcj->abij", latents, latents)
     u, values, v = jnp.linalg.svd(cross)
     sign = jnp.linalg.det(u) * jnp.linalg.det(v)
     proper = jnp.stack([jnp.ones_like(sign), jnp.ones_like(sign), sign], axis=-1)

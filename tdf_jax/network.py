@@ -23,6 +23,8 @@ import jax.numpy as jnp
 from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Bool, Float
 
+from tdf_jax.precision import full_precision
+
 Vectors = tuple[Float[Array, "points channels"], Float[Array, "points channels"], Float[Array, "points channels"]]
 
 VECTOR_EPSILON = 1e-6  # added to |d|^2 in the vector leaky ReLU, as in the original
@@ -360,6 +362,7 @@ class OccupancyNetwork(nn.Module):
         return self.decoder(latent)
 
 
+@full_precision
 def encode_latent(
     params,
     config: NetworkConfig,
@@ -379,11 +382,13 @@ def encode_latent(
     return OccupancyNetwork(config).apply({"params": params}, points, used, tip, method="encode_latent")
 
 
+@full_precision
 def condition(params, config: NetworkConfig, latent: Float[Array, "latent 3"]) -> Conditioned:
     """The decoder folded onto a latent."""
     return OccupancyNetwork(config).apply({"params": params}, latent, method="condition")
 
 
+@full_precision
 def decode(conditioned: Conditioned, x: Float[Array, "*batch 3"]) -> tuple[list, Float[Array, "*batch"]]:
     """Evaluate a conditioned decoder.
 

@@ -11,7 +11,7 @@ import tdf_jax
 
 PACKAGE = Path(tdf_jax.__file__).parent
 ORDER = """
-    errors keys files poses symmetry trajectory paths query meshes pointcloud views network field model refinement obstacles clearance checkpoint torch_pickle convert
+    errors keys files precision poses symmetry trajectory paths query meshes pointcloud views network field model refinement obstacles clearance checkpoint torch_pickle convert
     descriptor demonstration recording energy devices descent confidence recognition optimize solve carry modes grid landscape lattice sweep route imitation
     shapes evaluation benchmark training viz experiments cli
 """.split()
