@@ -96,8 +96,8 @@ def encode(model: Model, points: Float[Array, "points 3"], thinnings: int = THIN
         thinnings: how many are averaged, see `pointcloud.thinnings`; 0 uses all points as they are.
 
     Returns:
-        The field, in the world frame; it moves and turns with the points, exactly where they are used as they are by a network without asymmetry, and otherwise but for ties
-        that rounding decides: in thinning, and which point is the farthest from the mean.
+        The field, in the world frame. It moves and turns with the points but for ties that rounding decides: in thinning, and, of a network with asymmetry, in which
+        point is the farthest from the mean.
 
     Raises:
         InputError: the points are fewer than 21 or than the network's neighbours, not (points, 3), not finite or all equal; thinnings is negative, or the points would
@@ -112,7 +112,8 @@ def encode(model: Model, points: Float[Array, "points 3"], thinnings: int = THIN
     dense = not plain and len(points) > count
     traced = isinstance(points, jax.core.Tracer)
     whole = points if traced else np.asarray(points)
-    tip = whole[((whole - whole.mean(axis=0)) ** 2).sum(axis=1).argmax()]  # the same for all thinnings, which then take the same side of a symmetric object for its front
+    # One for all thinnings, which then take the same side of a symmetric object for its front.
+    tip = whole[((whole - whole.mean(axis=0)) ** 2).sum(axis=1).argmax()]
     if traced and dense:
         raise InputError(
             f"encode(): {len(points)} points cannot be thinned to {count} under jax.jit; expected that many. "

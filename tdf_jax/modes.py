@@ -248,7 +248,7 @@ def _covariance(field, query, descriptors, pose, scale):
     def once(found):
         count, lengths, axes, values = found  # the axes in columns, of length 1
         lengths = jnp.where(count == 0, lengths, stretched(values))
-        along = steps @ (axes * lengths).T
+        along = _product(steps, (axes * lengths).T)
         energies = jax.lax.map(energy, jnp.concatenate([along, -along])).reshape(2, -1)
         rises = jnp.mean(energies, axis=0) - start
         sums, differences = jnp.split(rises[6:], 2)

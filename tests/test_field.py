@@ -168,6 +168,8 @@ def test_a_displaced_cloud_is_seen_away_from_its_farthest_point(small_model, dis
     alone = encode_latent(small_model.params, displacing_model.config, centred)
     farthest = centred[np.argmax(np.linalg.norm(centred, axis=1))]
     np.testing.assert_allclose(alone, encode_latent(small_model.params, small_model.config, centred - 0.2 * farthest), atol=1e-5)
+    filled, used = np.concatenate([centred, 9 + centred[:5]]), np.arange(27) < 22
+    np.testing.assert_allclose(encode_latent(small_model.params, displacing_model.config, filled, used), alone, atol=1e-5)
     for field in (tdf.encode(displacing_model, few), jax.jit(lambda points: tdf.encode(displacing_model, points))(few)):
         np.testing.assert_allclose(field.latent, alone, atol=1e-5)
         np.testing.assert_allclose(field.origin, few.mean(axis=0), atol=1e-7)

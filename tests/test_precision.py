@@ -1,4 +1,4 @@
-"""Products are float32 products wherever poses and descriptors are computed; training leaves it to the device."""
+"""Products are float32 products where fields and both optimisers compute them; training leaves it to the device."""
 
 import functools
 import sys

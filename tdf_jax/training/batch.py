@@ -37,7 +37,7 @@ GLOBAL_SHARE = 0.4  # of the wrong poses: any rotation, any position about the o
 GLOBAL_SPREAD = 0.35  # standard deviation of the position, of the diagonal
 NEAR_ANGLES = (3.0, 90.0)  # degrees, log-uniform
 NEAR_DISTANCES = (0.01, 0.3)  # of the pair's diagonal, log-uniform
-QUARTERS = 4  # turns about the axis that are tried for a symmetric object's equal poses: the most that one with several fronts has
+QUARTERS = 4  # turns about the axis that are tried for a symmetric object's equal poses: all there are, but for round ones, which have any
 LEAST_WRONG = 0.01  # of the pair's diagonal: root mean square distance of query points from where a symmetric object's right poses have them
 
 
@@ -178,7 +178,7 @@ def _pair(rng, samples, diagonal, box, poses):
 
 
 def _equals(right, target):
-    """The right pose after each quarter turn about the target's axis that its symmetry allows, and as it is in place of the others."""
+    """The right pose after each quarter turn about the target's axis; turns that its symmetry does not allow are replaced by none."""
     T_mean_object = np.eye(4)
     T_mean_object[:3, 3] = target.centre
     turned = [T_mean_object @ about_z(quarter * np.pi / 2) @ np.linalg.inv(T_mean_object) @ right for quarter in range(QUARTERS)]

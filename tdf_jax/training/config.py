@@ -19,7 +19,7 @@ class TrainConfig:
         points: points of a cloud.
         queries: labelled points of an object, a step.
         box: query points shown at a place of every object and offered to its partner.
-        poses: poses they are offered at, the right one included.
+        poses: poses they are offered at, the right one, with its equals of a symmetric object, counted once.
         learning_rate: Muon's, on matrices; vectors, biases and the first layer use Adam at a sixth of it.
         warmup: steps of linear rise.
         corruption: how far clouds come from complete ones (0) to what sensors give (1). From random weights it grows from the tenth

@@ -19,7 +19,7 @@ from tdf_jax.evaluation.transfer import place_errors, transferred
 from tdf_jax.model import Model, ModelInfo
 from tdf_jax.network import encode_latent, initialise
 from tdf_jax.optimize import OptimizeConfig
-from tdf_jax.training.ahead import drawn_ahead
+from tdf_jax.training.ahead import asked_ahead, drawn_ahead
 from tdf_jax.training.batch import VALIDATION_DIAGONAL, Batch, draw, validation_pairs
 from tdf_jax.training.config import TrainConfig
 from tdf_jax.training.dataset import DataSet
@@ -52,7 +52,7 @@ def train(
         validation: others, to measure by.
         directory: receives `state.msgpack`, `metrics.jsonl` and `config.json`. A run that stands there with other settings, data or
             initial parameters is refused, except that `steps` may change.
-        initial: parameters of a network to go on from; random ones by default. Clouds then are as sensors give them from the first
+        initial: parameters of a network to go on from, with `config.network` that of its model; random ones by default. Clouds then are as sensors give them from the first
             step: a network that knew one view unlearned it while clouds were complete (IoU 0.48 to 0.08 in 500 steps).
         progress: show a progress bar.
         workers: processes that draw batches, which do not depend on how many there are; 1 is a thread of this one.
@@ -121,13 +121,14 @@ def steps_within(minutes: float, config: TrainConfig, data: DataSet, workers: in
     optimiser = _optimiser(config)
     params, state = _start(config, data, optimiser, None)
     times = []
+    waiting = asked_ahead(workers)  # drawn while the first step compiles: the steps that take them do not wait for samples
     with drawn_ahead(functools.partial(batch_of, config), data, 0, workers) as batches:
-        for step in range(TIMED_STEPS):
+        for step in range(waiting + TIMED_STEPS):
             began = time.monotonic()
             params, state, _ = _step(params, state, dataclasses.astuple(next(batches)), step, config.network, optimiser)
             jax.block_until_ready(params)
             times.append(time.monotonic() - began)
-    seconds = float(np.median(times[1:]))  # the first compiles
+    seconds = float(np.median(times[waiting:]))
     steps = int(0.9 * 60 * minutes / seconds)
     if steps <= config.warmup:
         raise InputError(

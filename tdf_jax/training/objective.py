@@ -84,9 +84,8 @@ def frame_error(
     rotated copies for it. Without this term, an early trial could not match an object with itself after 500 steps; with it, the frame
     is found within 200. A cloud seen from one side has its mean off the object's middle: the origin tells by how much.
 
-    A symmetric object has several fronts that are as good: the nearest counts. Were it exactly symmetric, all vectors of its latent would lie along its axis, and no
-    shape but one of revolution could be told from them; asked for any of its fronts, the network learns to choose one by the small unevenness that every cloud has.
-    Without, all oval and square bowls came out round (IoU 0.3).
+    A symmetric object has several fronts that are as good: the nearest counts. Asked for none, the network laid all vectors of a bowl's latent along its axis, and no
+    shape but one of revolution could be told from them (IoU of oval and square ones 0.3); asked for any, and shown clouds displaced (`NetworkConfig.asymmetry`), it tells their sides.
 
     Args:
         params: see `pair_loss`.
@@ -122,8 +121,8 @@ def place_error(
 def mean_gradient(params, config: NetworkConfig, *samples):
     """Gradients averaged over a batch of pairs of objects, and the loss and its parts of each.
 
-    On a CPU one pair after the other: a scan that adds up gradients holds one pair's activations at a time, and is faster there than `vmap`. Products are as fast as the device has them,
-    rounded to 10 bits on some accelerators, as the shipped weights of bowls and bottles were trained.
+    On a CPU one pair after the other: a scan that adds up gradients holds one pair's activations at a time, and is faster there than `vmap`. Products are of the device's default precision,
+    rounded to 10 bits on some accelerators, as the shipped weights of bowls, of bottles and of all three were trained.
     """
     with jax.default_matmul_precision(jax.config.jax_default_matmul_precision or "default"):
         return _mean_gradient(params, config, samples)
