@@ -11,9 +11,13 @@ from tdf_jax.field import DescriptorField
 POINTS = 1500  # of the cloud that are looked at: one size, so that clouds of all sizes run one program
 CUT = 3.0  # occupancy logits beyond it count no further: a few stray points must not decide
 
-# Logistic in (-log residual, surface logit), by name of shipped weights: intercept and two slopes, fitted on 40 right and 40 wrong cases of seed 61, as `python -m bench.recognition --fit` does; not yet tried on others.
+# Logistic in (-log residual, surface logit), by name of shipped weights: intercept and two slopes, fitted on right and wrong cases of seed 61 by
+# `python -m bench.recognition --fit`: 40 of each for mugs, 32 for bowls and for bottles, 48 for all three. Tried on others: docs/certainty.md.
 CURVES = {
     "mug": (-2.77, 6.25, 4.76),
+    "bowl": (-28.5, 16.9, -2.35),
+    "bottle": (-20.1, 16.7, 1.18),
+    "multi": (-5.40, 5.28, -0.01),
 }
 
 
