@@ -86,12 +86,17 @@ def test_shipped_weights_judge_the_object_and_others_do_not(small_model, monkeyp
     assert result.recognised == pytest.approx(tdf.recognition(*evidence, (0.3, 0.1, 0.1)))
 
 
-@pytest.mark.parametrize(("category", "doubted"), [("mug", False), ("bottle", True)])
-def test_a_bottle_given_to_the_mug_network_is_noticed(category, doubted):
-    shown, target = generated_case("mug", 0, 1), generated_case(category, 0, 1)
-    demonstration = place_demonstration(shown, "line", 2, tdf.box_query(KEY, 128, QUERY_SIZE))
+@pytest.mark.parametrize(("weights", "shown", "category", "doubted"), [
+    ("mug", "mug", "mug", False),
+    ("mug", "mug", "bottle", True),
+    ("multi", "bottle", "bottle", False),
+    ("multi", "bottle", "mug", True),  # it knows both
+])  # fmt: skip
+def test_an_object_of_another_category_is_noticed(weights, shown, category, doubted):
+    case, target = generated_case(shown, 0, 1), generated_case(category, 0, 1)
+    demonstration = place_demonstration(case, "line", 2, tdf.box_query(KEY, 128, QUERY_SIZE))
     with warnings.catch_warnings(record=True) as issued:
         warnings.simplefilter("always", tdf.CategoryWarning)
-        result = tdf.imitate(tdf.load_model("mug"), demonstration, target.points_b, key=KEY, fix_last=False)
+        result = tdf.imitate(tdf.load_model(weights), demonstration, target.points_b, key=KEY, fix_last=False)
     assert (result.recognised < 0.05) if doubted else (result.recognised > 0.8)
     assert len(issued) == doubted

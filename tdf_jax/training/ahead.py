@@ -71,7 +71,7 @@ def _in_order(ask, start, ahead):
             batch = asked.popleft().result()
         except concurrent.futures.process.BrokenProcessPool:
             raise InputError(
-                "train(): a process that drew samples died, perhaps for want of memory; expected it to live: use fewer (workers), and run again to go on"
+                "train(): a process that drew samples died, perhaps for want of memory; expected it to live: use fewer workers, and run again to go on"
             ) from None
         asked.append(ask(step))
         yield batch
