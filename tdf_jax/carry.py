@@ -93,7 +93,7 @@ def carry_trajectory(demonstrated: Trajectory, pick: Float[Array, "7"], goal: Fl
     turn = poses.geodesic(poses.rotation(pick_motion), poses.rotation(goal_motion), s)
     t = demonstrated.translations
     carried = (1 - s)[:, None] * poses.transform(pick_motion, t) + s[:, None] * poses.transform(goal_motion, t)
-    return Trajectory(poses.pose(jnp.matmul(turn, demonstrated.rotations, precision=jax.lax.Precision.HIGHEST), carried))
+    return Trajectory(poses.pose(poses.multiply(turn, demonstrated.rotations), carried))
 
 
 def carry(

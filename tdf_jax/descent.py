@@ -109,7 +109,7 @@ def _steps(R, place, waypoint, bounds, damping, tolerance, field, problem, energ
 
     def body(carry):
         i, state, damping, step, _, history = carry
-        R, place = poses.exp(step[:, :3]) @ state.R, state.place + step[:, 3:]
+        R, place = poses.multiply(poses.exp(step[:, :3]), state.R), state.place + step[:, 3:]
         trial = _State(R, place, *_evaluate(R, place, waypoint, bounds, field, problem, energy, chunk))
         # The first time nothing has moved and the state's energies are infinite: it takes what is finite.
         better = trial.energy < state.energy

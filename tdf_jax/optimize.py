@@ -309,7 +309,7 @@ def _begin(starts, query):
 def _poses(variables, start_rotations, query):
     """Rotations and translations (of the query frame's origin) of the variables."""
     turn, place = variables
-    R = jnp.matmul(poses.exp(turn), start_rotations, precision=jax.lax.Precision.HIGHEST)
+    R = poses.multiply(poses.exp(turn), start_rotations)
     return R, place - poses.rotate(R, jnp.mean(query, axis=0)[None])[..., 0, :]
 
 

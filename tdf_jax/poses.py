@@ -202,7 +202,7 @@ def geodesic(
     Returns:
         Rotation matrices. Between rotations a half turn apart it is one of the two ways that exist.
     """
-    return _multiply(R_a, exp(jnp.asarray(fraction)[..., None] * log(_relative(R_a, R_b))))
+    return multiply(R_a, exp(jnp.asarray(fraction)[..., None] * log(_relative(R_a, R_b))))
 
 
 @jax.jit
@@ -297,13 +297,17 @@ def rotate(R: Float[Array, "... 3 3"], x: Float[Array, "... queries 3"]) -> Floa
     return jnp.stack(components, axis=-1)
 
 
-def _multiply(R_a: Float[Array, "... 3 3"], R_b: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
-    # The default precision rounds float32 to 10 bits on some accelerators: 1e-3 radians.
+def multiply(R_a: Float[Array, "... 3 3"], R_b: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
+    """Rotations one after the other, the second first: R_a R_b; the default precision rounds float32 to 10 bits on some accelerators, 1e-3 radians.
+
+    Args:
+        R_a, R_b: Rotation matrices; batch axes broadcast.
+    """
     return jnp.matmul(R_a, R_b, precision=jax.lax.Precision.HIGHEST)
 
 
 def _relative(R_a: Float[Array, "... 3 3"], R_b: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
-    return _multiply(jnp.swapaxes(R_a, -1, -2), R_b)
+    return multiply(jnp.swapaxes(R_a, -1, -2), R_b)
 
 
 def _unit(wxyz: Float[Array, "... 4"]) -> Float[Array, "... 4"]:

@@ -175,14 +175,6 @@ def test_a_displaced_cloud_is_seen_away_from_its_farthest_point(small_model, dis
         np.testing.assert_allclose(field.origin, few.mean(axis=0), atol=1e-7)
 
 
-def test_a_displaced_field_moves_and_turns_with_its_cloud(displacing_model):
-    points = random_cloud(0, 90)
-    R = Rotation.random(random_state=0).as_matrix()
-    still, moved = (tdf.encode(displacing_model, cloud.astype(np.float32)) for cloud in (points, points @ R.T + 0.3))
-    np.testing.assert_allclose(moved.latent, still.latent @ R.T, atol=1e-4)
-    np.testing.assert_allclose(moved.origin, R @ still.origin + 0.3, atol=1e-6)
-
-
 def test_a_symmetric_object_has_sides_to_a_network_with_asymmetry_only(small_model, displacing_model):
     """A cloud that half a turn leaves as it is: without, all of its latent lies along the axis."""
     half = random_cloud(1, 12) - random_cloud(1, 12).mean(axis=0)
@@ -223,10 +215,11 @@ def test_latents_that_are_only_noisy_agree():
     assert np.asarray(agreeing(jnp.asarray(latents, jnp.float32), np.ones(8, bool))).all()
 
 
-def test_the_average_turns_with_the_cloud(thinning_model):
-    points = random_cloud(0, 90)
+@pytest.mark.parametrize("model", ["thinning_model", "displacing_model"])
+def test_the_average_turns_with_the_cloud(model, request):
+    model, points = request.getfixturevalue(model), random_cloud(0, 90)
     R = Rotation.random(random_state=0).as_matrix()
-    still, moved = (tdf.encode(thinning_model, cloud.astype(np.float32)) for cloud in (points, points @ R.T + 0.3))
+    still, moved = (tdf.encode(model, cloud.astype(np.float32)) for cloud in (points, points @ R.T + 0.3))
     np.testing.assert_allclose(moved.latent, still.latent @ R.T, atol=1e-4)
     np.testing.assert_allclose(moved.origin, R @ still.origin + 0.3, atol=1e-6)
 

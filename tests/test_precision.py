@@ -11,7 +11,7 @@ import pytest
 from conftest import SMALL, random_cloud, random_poses
 
 import tdf_jax as tdf
-from tdf_jax import descent
+from tdf_jax import descent, poses
 from tdf_jax.precision import full_precision
 from tdf_jax.training.objective import mean_gradient
 
@@ -61,6 +61,11 @@ def test_fields_and_their_derivatives_are_exact(small_model, problem):
     assert precisions(jax.grad(energy), jnp.asarray(random_poses(1, 2), jnp.float32)) == {EXACT}
     with jax.default_matmul_precision("tensorfloat32"):
         assert precisions(field.descriptors, points) == {jax.lax.Precision.HIGH}
+
+
+def test_rotations_are_multiplied_exactly_whatever_is_set():
+    with jax.default_matmul_precision("tensorfloat32"):
+        assert precisions(poses.multiply, jnp.eye(3), jnp.eye(3)) == {EXACT}
 
 
 @pytest.mark.parametrize(("optimise", "config", "module", "program"), [
