@@ -22,8 +22,8 @@ from bench.measure import matmul_gflops, measure
 from bench.parity import parity
 from bench.rows import QUICK, Sizes, rows, select
 from bench.workers import Workers, WorkerError
-from tdf_jax.errors import InputError
-from tdf_jax.files import replace_file
+from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.files import replace_file
 
 BASELINE = Path(__file__).with_name("baseline.json")
 BUSY_LOAD = 0.5  # processes; at a load of 5 on two cores PyTorch's steps took ten times as long

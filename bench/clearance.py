@@ -7,9 +7,9 @@ import jax
 import numpy as np
 
 import tdf_jax as tdf
-from tdf_jax.clearance import clearance, push_clear
-from tdf_jax.obstacles import box_obstacle
-from tdf_jax.paths import SHAPES
+from tdf_jax.planning.avoidance import clearance, push_clear
+from tdf_jax.planning.obstacles import box_obstacle
+from tdf_jax.geometry.paths import SHAPES
 
 
 def scene(seed: int, body):

@@ -5,7 +5,7 @@ competitors: what a competitor does beyond that (repeated latents, edge features
 rate, as it should. Element-wise work, neighbour search and sums of differences are not counted, so 100 % of the matmul peak cannot be reached.
 """
 
-from tdf_jax.network import NetworkConfig
+from tdf_jax.networks.occupancy import NetworkConfig
 
 EDGE_PRODUCTS = 4  # (e.e, e.x, x.x, c.c): what <feature, d> and |d|^2 of an edge are linear in
 

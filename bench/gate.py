@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from tdf_jax.errors import InputError
+from tdf_jax._internal.errors import InputError
 
 LEAST = 0.6  # of the baseline's ratio: two runs of one machine differed by a quarter under load
 

@@ -12,8 +12,8 @@ from flax.traverse_util import unflatten_dict
 
 import tdf_jax as tdf
 from bench import scene
-from tdf_jax import poses
-from tdf_jax.network import condition, decode, encode_latent
+from tdf_jax.geometry import se3 as poses
+from tdf_jax.networks.occupancy import condition, decode, encode_latent
 
 
 def prepare(task: str, tuned: bool, settings: dict, arrays: dict, state: dict[str, np.ndarray]) -> Callable[[], dict]:
@@ -89,8 +89,8 @@ def descent(model, settings, arrays):
 
 
 def solving(model, settings, arrays):
-    """`tdf_jax.solve.solve` with its default settings and starts of its own; the whole call."""
-    from tdf_jax.solve import SolveConfig, solve
+    """`tdf_jax.solvers.multistart.solve` with its default settings and starts of its own; the whole call."""
+    from tdf_jax.solvers.multistart import SolveConfig, solve
 
     field, reference, energy = _problem(model, arrays)
     goal = jnp.asarray(arrays["goal"])

@@ -8,7 +8,7 @@ import tdf_jax as tdf
 from bench import scene
 from bench.measure import check, difference
 from bench.workers import Workers
-from tdf_jax.errors import InputError
+from tdf_jax._internal.errors import InputError
 
 GOLDEN = Path(__file__).resolve().parents[1] / "tests" / "fixtures" / "ndf_latent32"
 ORIGINAL = {"float32": 5e-5, "float64": 1e-10}  # found: up to 1.8e-5 and 2e-14

@@ -8,8 +8,8 @@ import numpy as np
 import tdf_jax as tdf
 from bench import flops, machine, scene
 from bench.measure import OURS, PEERS, Plan, Row, check, difference
-from tdf_jax import lattice
-from tdf_jax.errors import InputError
+from tdf_jax.landscape import shared_lattice as lattice
+from tdf_jax._internal.errors import InputError
 
 NDF_RATES = {"rotation_rate": 0.01, "translation_rate": 0.01, "final_rate": 1.0}  # NDF's Adam, 1e-2 throughout
 POINT_BYTES = {"torch": 95e3, "torch_tuned": 120e3}  # of one query point's graph; measured 87 and 104 kB, tuned heaps have holes
@@ -130,7 +130,7 @@ def target(sizes: Sizes, same_rates: bool = False) -> Row:
         "torch_tuned": Plan("descent", common | {"steps": iterations}, once=True),
         "tdf_jax": Plan("descent", common | our_rates | {"iterations": iterations if same_rates else sizes.our_iterations}, once=same_rates),
     }
-    if importlib.util.find_spec("tdf_jax.solve"):
+    if importlib.util.find_spec("tdf_jax.solvers.multistart"):
         plans["tdf_jax_solve"] = Plan("solving", {"fix_last": True}, once=same_rates)
     if same_rates:
         del plans["torch"]  # its steps take the same time at any rates

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from bench.measure import measure
 from bench.rows import encoding, step
 from bench.workers import COMPETITORS, Workers
-from tdf_jax.files import replace_file
+from tdf_jax._internal.files import replace_file
 
 CENTRE = {"inits": 4, "poses": 7, "queries": 250}  # the others while one varies
 VALUES = {

@@ -8,16 +8,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from tdf_jax.carry import CarryConfig, carry
-from tdf_jax.confidence import CALIBRATED
-from tdf_jax.demonstration import Demonstration, Reference, describe
-from tdf_jax.energy import EnergyWeights
-from tdf_jax.errors import CategoryWarning, InputError
-from tdf_jax.keys import check_key
-from tdf_jax.model import Model, encode
-from tdf_jax.optimize import OptimizeConfig, Result, default_goal, optimize
-from tdf_jax.recognition import CURVES, recognition, surface_logit
-from tdf_jax.solve import SolveConfig, solve
+from tdf_jax.solvers.pick import CarryConfig, carry
+from tdf_jax.uncertainty.calibration import CALIBRATED
+from tdf_jax.energy.reference import Demonstration, Reference, describe
+from tdf_jax.energy.losses import EnergyWeights
+from tdf_jax._internal.errors import CategoryWarning, InputError
+from tdf_jax._internal.checks import check_key
+from tdf_jax.networks.model import Model, encode
+from tdf_jax.solvers.adam import OptimizeConfig, Result, default_goal, optimize
+from tdf_jax.uncertainty.category import CURVES, recognition, surface_logit
+from tdf_jax.solvers.multistart import SolveConfig, solve
 
 DOUBT = 0.5  # probability of the demonstration's category below which a warning is issued
 

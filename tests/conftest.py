@@ -13,8 +13,8 @@ from flax.traverse_util import unflatten_dict
 from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
-from tdf_jax.field import DescriptorField
-from tdf_jax.network import OccupancyNetwork, condition, parameter_shapes
+from tdf_jax.networks.field import DescriptorField
+from tdf_jax.networks.occupancy import OccupancyNetwork, condition, parameter_shapes
 
 jax.config.update("jax_debug_nans", True)
 

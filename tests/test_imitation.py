@@ -8,8 +8,8 @@ import pytest
 from conftest import compilations, random_cloud, random_poses
 
 import tdf_jax as tdf
-from tdf_jax.errors import InputError
-from tdf_jax.pointcloud import thin
+from tdf_jax._internal.errors import InputError
+from tdf_jax.io.pointclouds import thin
 
 CONFIG = tdf.OptimizeConfig(inits=3, iterations=5)
 KEY = jax.random.key(0)

@@ -43,16 +43,16 @@ def benchmark(
         demonstrations: also measure picks learnt from so many demonstrations, such as 1 3 5 10.
         out: folder for the page; what was computed is kept in its folder runs.
     """
-    from tdf_jax.benchmark.methods import METHODS
-    from tdf_jax.benchmark.page import page, record, sections
-    from tdf_jax.benchmark.demonstrations import learnt
-    from tdf_jax.benchmark.run import run
-    from tdf_jax.benchmark.scores import score
-    from tdf_jax.checkpoint import load_model
-    from tdf_jax.errors import InputError
-    from tdf_jax.evaluation.annotated import load_annotated
-    from tdf_jax.files import replace_file
-    from tdf_jax.meshes import libigl
+    from tdf_jax.evaluation.methods import METHODS
+    from tdf_jax.evaluation.path_page import page, record, sections
+    from tdf_jax.evaluation.demonstration_count import learnt
+    from tdf_jax.evaluation.path_runs import run
+    from tdf_jax.evaluation.path_scores import score
+    from tdf_jax.networks.checkpoint import load_model
+    from tdf_jax._internal.errors import InputError
+    from tdf_jax.evaluation.annotated_meshes import load_annotated
+    from tdf_jax._internal.files import replace_file
+    from tdf_jax.io.meshes import libigl
 
     _check(pairs, seed, height, clouds, methods, inits, meshes, poses, demonstrations)
     names = list(METHODS) if "all" in methods else [name for name in METHODS if name in methods]
@@ -81,7 +81,7 @@ def benchmark(
 
 
 def _makers(pairs, seed, height, clouds, targets, poses) -> list[Callable]:
-    from tdf_jax.benchmark.task import make_task, mesh_index
+    from tdf_jax.evaluation.path_tasks import make_task, mesh_index
     from tdf_jax.evaluation.cases import mesh_case, mug_case
 
     def generated(index):
@@ -95,10 +95,10 @@ def _makers(pairs, seed, height, clouds, targets, poses) -> list[Callable]:
 
 
 def _draw(out, makers, scores, extras) -> None:
-    from tdf_jax.benchmark.methods import LIBRARY
-    from tdf_jax.benchmark.page import PICTURES
-    from tdf_jax.paths import PATHS
-    from tdf_jax.viz.benchmark import demonstrations_figure, errors_figure, reliability_figure, truth_figure
+    from tdf_jax.evaluation.methods import LIBRARY
+    from tdf_jax.evaluation.path_page import PICTURES
+    from tdf_jax.geometry.paths import PATHS
+    from tdf_jax.viz.evaluation import demonstrations_figure, errors_figure, reliability_figure, truth_figure
     from tdf_jax.viz.style import save_figure
 
     # The first six tasks are one of each path, not displaced; later ones show where goals go.
@@ -115,7 +115,7 @@ def _draw(out, makers, scores, extras) -> None:
 
 def _folder(out: Path) -> Path:
     """The folder of what was computed, made now: an hour of work is lost where it cannot be."""
-    from tdf_jax.errors import InputError
+    from tdf_jax._internal.errors import InputError
 
     if (out / PAGE).exists() and not (out / RECORD).exists():
         raise InputError(f"tdf benchmark: {out / PAGE} is not of an earlier benchmark, there is no {RECORD} beside it; expected another --out: nothing of yours is overwritten")
@@ -127,9 +127,9 @@ def _folder(out: Path) -> Path:
 
 
 def _check(pairs, seed, height, clouds, methods, inits, meshes, poses, demonstrations) -> None:
-    from tdf_jax.benchmark.demonstrations import MOST
-    from tdf_jax.benchmark.methods import METHODS
-    from tdf_jax.errors import InputError
+    from tdf_jax.evaluation.demonstration_count import MOST
+    from tdf_jax.evaluation.methods import METHODS
+    from tdf_jax._internal.errors import InputError
 
     def need(truth, what):
         if not truth:

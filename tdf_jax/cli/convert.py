@@ -5,9 +5,9 @@ from typing import Annotated
 
 import tyro
 
-from tdf_jax.checkpoint import save_model
-from tdf_jax.convert import convert_checkpoint
-from tdf_jax.network import parameter_count
+from tdf_jax.networks.checkpoint import save_model
+from tdf_jax.networks.ndf_checkpoint import convert_checkpoint
+from tdf_jax.networks.occupancy import parameter_count
 
 
 def convert(

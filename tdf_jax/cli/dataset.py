@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from tdf_jax.errors import InputError
+from tdf_jax._internal.errors import InputError
 from tdf_jax.training.dataset import Recipe, build, load
 
 

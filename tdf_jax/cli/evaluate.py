@@ -50,16 +50,17 @@ def evaluate(
     import functools
     import sys
 
-    from tdf_jax.checkpoint import load_model
-    from tdf_jax.cli import card as cards, scores
-    from tdf_jax.cli.settings import categories_of
-    from tdf_jax.errors import InputError
-    from tdf_jax.evaluation.annotated import load_annotated
+    from tdf_jax.networks.checkpoint import load_model
+    from tdf_jax.evaluation import model_card as cards
+    from tdf_jax.evaluation import report as scores
+    from tdf_jax.cli.options import categories_of
+    from tdf_jax._internal.errors import InputError
+    from tdf_jax.evaluation.annotated_meshes import load_annotated
     from tdf_jax.evaluation.cases import generated_case, mesh_case
-    from tdf_jax.evaluation.clouds import CONDITIONS
+    from tdf_jax.evaluation.conditions import CONDITIONS
     from tdf_jax.evaluation.comparison import BASELINES, compare
-    from tdf_jax.meshes import libigl
-    from tdf_jax.optimize import OptimizeConfig
+    from tdf_jax.io.meshes import libigl
+    from tdf_jax.solvers.adam import OptimizeConfig
 
     _check_numbers(pairs, seed, size, clouds, meshes, poses)
     categories = tuple(dict.fromkeys(category or categories_of(weights)))
@@ -101,7 +102,7 @@ def evaluate(
 
 
 def _check_numbers(pairs, seed, size, clouds, meshes, poses) -> None:
-    from tdf_jax.errors import InputError
+    from tdf_jax._internal.errors import InputError
 
     if pairs < 1 and (meshes is None or pairs < 0):
         raise InputError(f"tdf evaluate: --pairs is {pairs}; expected at least 1, or 0 with --meshes")
@@ -116,7 +117,7 @@ def _check_numbers(pairs, seed, size, clouds, meshes, poses) -> None:
 
 
 def _check_place(place: str | None, categories: tuple[str, ...]) -> None:
-    from tdf_jax.errors import InputError
+    from tdf_jax._internal.errors import InputError
     from tdf_jax.shapes import FAMILIES
 
     for category in categories:
@@ -126,7 +127,7 @@ def _check_place(place: str | None, categories: tuple[str, ...]) -> None:
 
 def _check_outputs(json: Path | None, card: Path | None, figures: Path | None) -> None:
     """Refuse now what could not be written in an hour."""
-    from tdf_jax.errors import InputError
+    from tdf_jax._internal.errors import InputError
 
     for name, path in (("json", json), ("card", card)):
         if path is not None and (path.is_dir() or not path.parent.is_dir()):

@@ -14,20 +14,20 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from tdf_jax.carry import CarryConfig
-from tdf_jax.checkpoint import load_model
+from tdf_jax.solvers.pick import CarryConfig
+from tdf_jax.networks.checkpoint import load_model
 from tdf_jax.cli import report
 from tdf_jax.cli.scene import make_scene
-from tdf_jax.cli.settings import Settings, resolved
-from tdf_jax.demonstration import describe
-from tdf_jax.energy import EnergyWeights
-from tdf_jax.errors import CategoryWarning, InputError
+from tdf_jax.cli.options import Settings, resolved
+from tdf_jax.energy.reference import describe
+from tdf_jax.energy.losses import EnergyWeights
+from tdf_jax._internal.errors import CategoryWarning, InputError
 from tdf_jax.evaluation.scene import Scene
-from tdf_jax.files import replace_file, replace_folder
+from tdf_jax._internal.files import replace_file, replace_folder
 from tdf_jax.imitation import imitate as imitate_scene
-from tdf_jax.optimize import OptimizeConfig, Result
-from tdf_jax.solve import SolveConfig
-from tdf_jax.trajectory import save_trajectory
+from tdf_jax.solvers.adam import OptimizeConfig, Result
+from tdf_jax.solvers.multistart import SolveConfig
+from tdf_jax.geometry.trajectory import save_trajectory
 
 # Folded into the seed's key: `random_pose` draws a generated mug's rotation from the key of the same seed, and a start
 # drawn from that one would be the answer.
@@ -104,7 +104,7 @@ def _steps(config: CarryConfig | SolveConfig | OptimizeConfig) -> int:
 
 
 def _draw(folder: Path, scene: Scene, result: Result, rows: str) -> None:
-    from tdf_jax.viz.plots import imitation_figure, loss_figure
+    from tdf_jax.viz.imitation import imitation_figure, loss_figure
     from tdf_jax.viz.style import save_figure
 
     trajectory = result.trajectory

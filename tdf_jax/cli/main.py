@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import jax
 import tyro
 
-from tdf_jax.errors import InputError
+from tdf_jax._internal.errors import InputError
 
 MEMORY = "error: out of memory; lower the number of starts, poses, query points or points, or raise the pitch"
 COMMANDS = ("imitate", "landscape", "convert", "evaluate", "benchmark", "shapes", "dataset", "train", "reproduce")  # each is a function in the module of its name

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
-from tdf_jax import poses
-from tdf_jax.cli.scores import Outcomes, is_real
-from tdf_jax.errors import InputError
+from tdf_jax.geometry import se3 as poses
+from tdf_jax.evaluation.report import Outcomes, is_real
+from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.comparison import Outcome
-from tdf_jax.evaluation.transfer import QUERY_SIZE
-from tdf_jax.model import Model, encode
-from tdf_jax.refinement import refine
+from tdf_jax.evaluation.pick_transfer import QUERY_SIZE
+from tdf_jax.networks.model import Model, encode
+from tdf_jax.networks.refinement import refine
 from tdf_jax.viz.style import save_figure
 from tdf_jax.viz.reconstruction import Panel, reconstructed, reconstruction_figure, transfer_figure
 

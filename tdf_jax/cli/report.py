@@ -7,16 +7,16 @@ import jax
 import numpy as np
 
 import tdf_jax
-from tdf_jax.carry import CarryConfig
-from tdf_jax.cli.settings import Settings
-from tdf_jax.energy import EnergyWeights
+from tdf_jax.solvers.pick import CarryConfig
+from tdf_jax.cli.options import Settings
+from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.evaluation.scene import Scene
-from tdf_jax.evaluation.truth import path_error, pose_error
-from tdf_jax.model import Model
-from tdf_jax.modes import cluster_poses
-from tdf_jax.optimize import OptimizeConfig, Result
-from tdf_jax.solve import SolveConfig
-from tdf_jax.trajectory import Trajectory
+from tdf_jax.evaluation.metrics import path_error, pose_error
+from tdf_jax.networks.model import Model
+from tdf_jax.uncertainty.modes import cluster_poses
+from tdf_jax.solvers.adam import OptimizeConfig, Result
+from tdf_jax.solvers.multistart import SolveConfig
+from tdf_jax.geometry.trajectory import Trajectory
 
 SCHEMA = 2  # raised when a field of result.json changes its meaning or goes
 RESULT = "result.json"

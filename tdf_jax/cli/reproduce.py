@@ -8,13 +8,15 @@ from typing import Annotated, Literal
 import tyro
 from tqdm import tqdm
 
-from tdf_jax.checkpoint import load_model
-from tdf_jax.errors import InputError
-from tdf_jax.experiments import figures, landscapes, table
-from tdf_jax.experiments.run import Run
-from tdf_jax.experiments.setting import Setting, scene
-from tdf_jax.experiments.store import Store
-from tdf_jax.files import replace_file
+from tdf_jax.networks.checkpoint import load_model
+from tdf_jax._internal.errors import InputError
+from tdf_jax.paper import figures
+from tdf_jax.paper import figure2 as landscapes
+from tdf_jax.paper import table
+from tdf_jax.paper.runs import Run
+from tdf_jax.paper.setting import Setting, scene
+from tdf_jax.paper.store import Store
+from tdf_jax._internal.files import replace_file
 
 EXPERIMENTS = ("table1", "fig1", "fig2", "fig3", "fig4", "fig5")
 # What each sets itself; "all" is all of them.
@@ -78,14 +80,14 @@ def _table1(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path
 
 
 def _fig1(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
-    from tdf_jax.experiments import pictures
+    from tdf_jax.viz import paper as pictures
 
     settings = figures.figure1(base)
     yield _picture(out / "fig1.png", pictures.figure1(_run_all(store, settings, "figure 1"), scene(settings["l_t"])))
 
 
 def _fig2(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
-    from tdf_jax.experiments import pictures
+    from tdf_jax.viz import paper as pictures
 
     count = FAST_GRID if fast else GRID
     fields = {name: store.landscapes(base, name, count) for name in tqdm(landscapes.FIELDS, desc="figure 2", unit="field")}
@@ -94,14 +96,14 @@ def _fig2(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
 
 
 def _fig3(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
-    from tdf_jax.experiments import pictures
+    from tdf_jax.viz import paper as pictures
 
     settings = figures.figure3(base, (0.25, *figures.PAPER_DISTANCES), 1) if fast else figures.figure3(base)
     yield _picture(out / "fig3.png", pictures.figure3(_run_all(store, settings, "figure 3")))
 
 
 def _fig4(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
-    from tdf_jax.experiments import pictures
+    from tdf_jax.viz import paper as pictures
 
     settings = figures.figure4(base)
     runs = _run_all(store, settings, "figure 4")
@@ -110,7 +112,7 @@ def _fig4(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
 
 
 def _fig5(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
-    from tdf_jax.experiments import pictures
+    from tdf_jax.viz import paper as pictures
 
     yield _picture(out / "fig5.png", pictures.figure5(_run_all(store, figures.figure5(base), "figure 5")))
 

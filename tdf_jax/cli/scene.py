@@ -5,17 +5,17 @@ import dataclasses
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from tdf_jax.cli.settings import SceneSettings
-from tdf_jax.demonstration import Demonstration
-from tdf_jax.errors import InputError
+from tdf_jax.cli.options import SceneSettings
+from tdf_jax.energy.reference import Demonstration
+from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.cases import Case, generated_case, random_pose
 from tdf_jax.evaluation.scene import Scene, place_demonstration
-from tdf_jax.evaluation.transfer import QUERY_SIZE
-from tdf_jax.meshes import load_mesh
-from tdf_jax.pointcloud import load_points
-from tdf_jax.query import box_query
-from tdf_jax.recording import load_demonstration
-from tdf_jax.trajectory import resample
+from tdf_jax.evaluation.pick_transfer import QUERY_SIZE
+from tdf_jax.io.meshes import load_mesh
+from tdf_jax.io.pointclouds import load_points
+from tdf_jax.geometry.query import box_query
+from tdf_jax.io.demonstrations import load_demonstration
+from tdf_jax.geometry.trajectory import resample
 
 
 def make_scene(settings: SceneSettings, key: PRNGKeyArray) -> Scene:

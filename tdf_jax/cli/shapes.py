@@ -24,11 +24,11 @@ def shapes(
     """
     import numpy as np
 
-    from tdf_jax.errors import InputError
-    from tdf_jax.evaluation.annotated import load_annotated
+    from tdf_jax._internal.errors import InputError
+    from tdf_jax.evaluation.annotated_meshes import load_annotated
     from tdf_jax.shapes import FAMILIES
-    from tdf_jax.symmetry import FOLDS
-    from tdf_jax.viz.sheet import contact_sheet
+    from tdf_jax.geometry.symmetry import FOLDS
+    from tdf_jax.viz.contact_sheet import contact_sheet
     from tdf_jax.viz.style import save_figure
 
     if count < 1:

@@ -7,14 +7,14 @@ from typing import Annotated
 
 import tyro
 
-from tdf_jax.checkpoint import SUFFIX, load_model, save_model
-from tdf_jax.errors import InputError
-from tdf_jax.model import Model, ModelInfo
-from tdf_jax.training.ahead import usual_workers
+from tdf_jax.networks.checkpoint import SUFFIX, load_model, save_model
+from tdf_jax._internal.errors import InputError
+from tdf_jax.networks.model import Model, ModelInfo
+from tdf_jax.training.prefetch import usual_workers
 from tdf_jax.training.config import TrainConfig
 from tdf_jax.training.dataset import Recipe, build, joined, load
 from tdf_jax.training.loop import steps_within, train as run
-from tdf_jax.training.record import metrics, settings_of
+from tdf_jax.training.run_folder import metrics, settings_of
 
 
 def train(
@@ -45,7 +45,7 @@ def train(
         workers: processes that draw the samples of the steps to come.
         config: settings of the run.
     """
-    from tdf_jax.viz.curves import training_figure
+    from tdf_jax.viz.training import training_figure
     from tdf_jax.viz.style import save_figure
 
     if minutes is not None and not 0 < minutes < float("inf"):

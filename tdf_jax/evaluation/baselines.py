@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 from tqdm import tqdm
 
-from tdf_jax import poses
-from tdf_jax.errors import InputError
+from tdf_jax.geometry import se3 as poses
+from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.cases import Case
 
 if TYPE_CHECKING:

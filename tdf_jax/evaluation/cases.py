@@ -7,11 +7,11 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from tdf_jax import poses
-from tdf_jax.errors import InputError
-from tdf_jax.evaluation.annotated import AnnotatedMesh
-from tdf_jax.evaluation.clouds import CONDITIONS, SCALES, observed
-from tdf_jax.meshes import sample_surface
+from tdf_jax.geometry import se3 as poses
+from tdf_jax._internal.errors import InputError
+from tdf_jax.evaluation.annotated_meshes import AnnotatedMesh
+from tdf_jax.evaluation.conditions import CONDITIONS, SCALES, observed
+from tdf_jax.io.meshes import sample_surface
 from tdf_jax.shapes import FAMILIES, Mug, Shape, scaled
 
 SEED_SPACE = 7_000_001  # keeps evaluation objects apart from training's, which are drawn from [seed, index]
@@ -49,7 +49,7 @@ class Case(Transfer):
     Attributes:
         object_a, object_b: the objects, in their canonical frames.
         instance: name of object b; cases of one object in several poses share it.
-        clouds: the condition of `points_b`, one of `tdf_jax.evaluation.clouds.CONDITIONS`.
+        clouds: the condition of `points_b`, one of `tdf_jax.evaluation.conditions.CONDITIONS`.
     """
 
     object_a: Shape

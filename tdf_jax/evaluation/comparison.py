@@ -7,14 +7,14 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from tdf_jax.errors import InputError
+from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.baselines import METHODS, aligned
 from tdf_jax.evaluation.cases import Case
-from tdf_jax.evaluation.summary import summary
-from tdf_jax.evaluation.transfer import no_overlaps, overlaps, place_errors, tilts, transferred
-from tdf_jax.model import Model
-from tdf_jax.network import initialise
-from tdf_jax.optimize import OptimizeConfig
+from tdf_jax.evaluation.statistics import summary
+from tdf_jax.evaluation.pick_transfer import no_overlaps, overlaps, place_errors, tilts, transferred
+from tdf_jax.networks.model import Model
+from tdf_jax.networks.occupancy import initialise
+from tdf_jax.solvers.adam import OptimizeConfig
 
 UNTRAINED = "random weights"
 BASELINES = (UNTRAINED, *METHODS)
@@ -30,7 +30,7 @@ class Outcome:
         found: poses `wxyz_xyz` of the place, world frame, (cases, 7).
         distance: position errors, metres, (cases,).
         angle: rotation errors, degrees, (cases,).
-        ious: see `tdf_jax.evaluation.transfer.overlaps`.
+        ious: see `tdf_jax.evaluation.pick_transfer.overlaps`.
         summary: see `tdf_jax.evaluation.summary`.
     """
 

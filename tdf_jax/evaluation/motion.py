@@ -3,9 +3,9 @@
 import numpy as np
 from jaxtyping import Float
 
-from tdf_jax.evaluation.annotated import AnnotatedMesh
+from tdf_jax.evaluation.annotated_meshes import AnnotatedMesh
 from tdf_jax.shapes import Mug
-from tdf_jax.trajectory import Trajectory
+from tdf_jax.geometry.trajectory import Trajectory
 
 
 def frechet_distance(found: Float[np.ndarray, "poses 3"], truth: Float[np.ndarray, "others 3"]) -> float:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from tdf_jax.errors import InputError
+from tdf_jax._internal.errors import InputError
 
 if TYPE_CHECKING:
     import trimesh

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Array, Float
 
-from tdf_jax.demonstration import Demonstration
+from tdf_jax.energy.reference import Demonstration
 from tdf_jax.evaluation.cases import Case
-from tdf_jax.evaluation.truth import expected_trajectory, nearest_place
-from tdf_jax.paths import PATHS, SHAPES
-from tdf_jax.trajectory import Trajectory
+from tdf_jax.evaluation.metrics import expected_trajectory, nearest_place
+from tdf_jax.geometry.paths import PATHS, SHAPES
+from tdf_jax.geometry.trajectory import Trajectory
 
 if TYPE_CHECKING:
     import trimesh
@@ -60,7 +60,7 @@ def place_demonstration(case: Case, path: str, poses: int, query: Float[Array, "
 
     Args:
         case: with the object and the place on it.
-        path: one of `tdf_jax.paths.PATHS`.
+        path: one of `tdf_jax.geometry.paths.PATHS`.
         poses: of the trajectory.
         query: points in the query frame, metres.
     """

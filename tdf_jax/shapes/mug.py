@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from tdf_jax.errors import InputError
+from tdf_jax._internal.errors import InputError
 from tdf_jax.shapes.shape import Clay, Shape, accepted, check_numbers, frame, is_one_body, moulded
 from tdf_jax.shapes.solid import Solid, Tube, bar_line, bends_freely, in_solid, inset, polygon, swept, tube_rings
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from tdf_jax.errors import InputError
+from tdf_jax._internal.errors import InputError
 from tdf_jax.shapes.solid import Part, encloses, rings, skin
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class Shape(ABC):
 
     @property
     def fold(self) -> int:
-        """Its symmetry about z: 1 none, 2 half turns, 4 quarters, 0 any turn leave it as it is (`tdf_jax.symmetry`)."""
+        """Its symmetry about z: 1 none, 2 half turns, 4 quarters, 0 any turn leave it as it is (`tdf_jax.geometry.symmetry`)."""
         return self.parameters.fold
 
     @property

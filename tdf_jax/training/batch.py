@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from tdf_jax.pointcloud import thin
-from tdf_jax.symmetry import about_z, nearest_turn
+from tdf_jax.io.pointclouds import thin
+from tdf_jax.geometry.symmetry import about_z, nearest_turn
 from tdf_jax.training.dataset import DataSet
-from tdf_jax.training.objects import BOX_PADDING
+from tdf_jax.training.labels import BOX_PADDING
 
 DIAGONALS = (0.08, 0.5)  # metres; every draw rescales its pair to a diagonal log-uniform in this range
 USUAL_DIAGONALS = (0.12, 0.25)  # or, half of the time, in this one, a real mug's

@@ -3,8 +3,8 @@
 import dataclasses
 import math
 
-from tdf_jax.errors import InputError
-from tdf_jax.network import NetworkConfig
+from tdf_jax._internal.errors import InputError
+from tdf_jax.networks.occupancy import NetworkConfig
 from tdf_jax.training.batch import DENSE
 
 

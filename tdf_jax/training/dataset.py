@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from tqdm import tqdm
 
-from tdf_jax.errors import InputError
-from tdf_jax.files import replace_file
-from tdf_jax.meshes import MESH_SUFFIXES, file_axes, libigl
+from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.files import replace_file
+from tdf_jax.io.meshes import MESH_SUFFIXES, file_axes, libigl
 from tdf_jax.shapes import FAMILIES
-from tdf_jax.symmetry import FOLDS
-from tdf_jax.training.objects import UNIFORM_SHARE, Labelled, canonical_mesh, generated_object, scanned_object
+from tdf_jax.geometry.symmetry import FOLDS
+from tdf_jax.training.labels import UNIFORM_SHARE, Labelled, canonical_mesh, generated_object, scanned_object
 
 MANIFEST = "dataset.json"
 SHARD = 50  # objects in a file, 9 MB: what a kill can lose

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from tdf_jax.devices import one_at_a_time
-from tdf_jax.field import DescriptorField
-from tdf_jax.network import NetworkConfig, condition, decode, encode_latent
+from tdf_jax._internal.devices import one_at_a_time
+from tdf_jax.networks.field import DescriptorField
+from tdf_jax.networks.occupancy import NetworkConfig, condition, decode, encode_latent
 from tdf_jax.training.batch import QUARTERS
 
 FRAME_WEIGHT = 0.3

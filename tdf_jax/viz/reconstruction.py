@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
-from tdf_jax.field import DescriptorField
-from tdf_jax.meshes import libigl
-from tdf_jax.viz import solid
+from tdf_jax.networks.field import DescriptorField
+from tdf_jax.io.meshes import libigl
+from tdf_jax.viz import polygons3d as solid
 from tdf_jax.viz.style import CENTIMETRES, INK, LIGHT, STYLE, TRUTH
 
 FOUND = "#2a6f97"

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from tdf_jax.files import replace_file
+from tdf_jax._internal.files import replace_file
 
 COLOURS = matplotlib.colormaps["viridis"]  # readable in grey and by the colour-blind
 CLOUD, INK, TRUTH = "#56616e", "#222222", "#d1495b"

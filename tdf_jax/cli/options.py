@@ -1,0 +1,187 @@
+"""Options of `tdf imitate` and `tdf landscape`."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+import tyro
+
+from tdf_jax._internal.errors import InputError
+from tdf_jax.landscape.shortest_path import SHARPEST
+from tdf_jax.shapes import FAMILIES
+
+SEEDS = 2**32  # jax cuts a larger one to 32 bits without a word
+
+
+def _option(metavar: str | None = None, default: str | None = None):
+    """How the help names a value and a default that is not one."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=None if default is None else f"(default: {default})")
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneSettings:
+    """A demonstration and a new object, from files or generated.
+
+    Attributes:
+        target: mesh or point cloud of the new object.
+        scale: metres per unit of the target file: 0.01 for centimetres.
+        target_pose: how the target lies in the world: as its file says, or moved by a random rotation and translation.
+        demonstration: .npz with points (N, 3), wxyz_xyz (n, 7) and query (Q, 3), in metres.
+        category: of generated objects.
+        trajectory: shape of a generated demonstration, from a mug's handle, a bowl's rim or a bottle's neck to a place 0.30 m away; lift_over sets it down on a shelf there.
+        poses: of the trajectory; a demonstration file is resampled to another number.
+        queries: query points of a generated demonstration.
+        points: drawn from a mesh, or from a larger cloud.
+        seed: of every draw.
+        weights: a name of shipped weights, or a .safetensors file.
+    """
+
+    target: Annotated[Path | None, _option("FILE", "a generated object")] = None
+    scale: float = 1.0
+    target_pose: Annotated[Literal["given", "random"] | None, _option(default="given for a file, random for a generated object")] = None
+    demonstration: Annotated[Path | None, _option("FILE", "one on another generated object")] = None
+    category: Annotated[Literal["mug", "bowl", "bottle"] | None, _option(default="that of shipped weights; mug")] = None
+    trajectory: Annotated[Literal["line", "semicircle", "wave", "lift_over", "tilt_and_pour", "hang_on_rack"] | None, _option(default="wave of a mug, lift_over of others")] = None
+    poses: Annotated[int | None, _option("INT", "7, or those of the demonstration file")] = None
+    queries: Annotated[int | None, _option("INT", "128")] = None
+    points: int = 1500
+    seed: int = 0
+    weights: Annotated[str | None, _option("NAME|FILE", "those of the category")] = None
+
+    COMMAND: ClassVar[str] = "tdf"
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings(SceneSettings):
+    """What to imitate, on what, and how.
+
+    Attributes:
+        goal_offset: metres in the world, added to where the last pose goes.
+        k: weight of the correlation term of eq. 3, for the methods that minimise it; the paper's best is 0.02.
+        method: carry the demonstration from the pick to the goal; or minimise the paper's energy, eq. 3, by damped Gauss-Newton steps, or by Adam's as the paper does.
+        inits: random starts.
+        iterations: Adam's steps.
+        out: folder to write; an earlier result there is replaced.
+        no_plots: leave out imitation.png and loss.png.
+        json: print result.json instead of the table.
+    """
+
+    goal_offset: Annotated[tuple[float, float, float], _option("X Y Z")] = (0.0, 0.0, 0.0)
+    k: Annotated[float | None, _option("FLOAT", "0.02")] = None
+    method: Literal["carry", "gauss-newton", "adam"] = "carry"
+    inits: Annotated[int | None, _option("INT", "64 of the pick; 10 of other methods")] = None
+    iterations: Annotated[int | None, _option("INT", "100")] = None
+    out: Annotated[Path, _option("DIR")] = Path("imitation")
+    no_plots: bool = False
+    json: bool = False
+
+    COMMAND: ClassVar[str] = "tdf imitate"
+
+
+@dataclasses.dataclass(frozen=True)
+class LandscapeSettings(SceneSettings):
+    """What to sweep the query frame over, and how.
+
+    Attributes:
+        target_pose: as its file says, or moved by a random rotation and translation.
+        grid: a plane through the middle of the demonstration's path, a volume about it, or the path's neighbourhood; along the axes of the
+            orientation, or of the world where there are many.
+        half: of the plane's or volume's side, metres.
+        radius: of the neighbourhood of a path, metres.
+        pitch: distance of neighbouring points, metres; the side is rounded to whole ones.
+        query: a lattice of the grid's pitch in the box of the demonstration's query points, or those points moved onto it, or as they
+            are: some thirty times slower in one orientation; with many, a lattice would save nothing.
+        rotation: of the query frame: the demonstration's at the pick, the world's axes (as in the paper), the best of many at every
+            point, or the pick's turned about an axis, the best at every point.
+        rotations: number of them for "best" and "turns".
+        axis: of "turns", in the world.
+        reduce: how the waypoints' energies are combined: the least, a soft least, each in its ring about the pick, or the mean.
+        sharpness: of the lowest-cost path from the pick to the goal: power of the energy that it adds up.
+        no_page: leave out landscape.html.
+        out: folder to write; an earlier result there is replaced.
+        no_plots: leave out all pictures and the page.
+        json: print result.json instead of the table.
+    """
+
+    target_pose: Annotated[Literal["given", "random"] | None, _option(default="given")] = None
+    grid: Literal["xy", "xz", "yz", "volume", "path"] = "yz"
+    half: float = 0.3
+    radius: float = 0.1
+    pitch: float = 0.012
+    query: Annotated[Literal["lattice", "snapped", "given"] | None, _option(default="lattice; given for many orientations")] = None
+    rotation: Literal["pick", "identity", "best", "turns"] = "pick"
+    rotations: int = 24
+    axis: Annotated[tuple[float, float, float], _option("X Y Z")] = (0.0, 0.0, 1.0)
+    reduce: Literal["least", "soft_least", "assigned", "mean"] = "least"
+    sharpness: float = 1.0
+    no_page: bool = False
+    out: Annotated[Path, _option("DIR")] = Path("landscape")
+    no_plots: bool = False
+    json: bool = False
+
+    COMMAND: ClassVar[str] = "tdf landscape"
+
+
+def categories_of(weights: str | None) -> tuple[str, ...]:
+    """Categories that shipped weights were made for; mugs, of other files."""
+    if weights == "multi":
+        return tuple(FAMILIES)
+    return (weights,) if weights in FAMILIES else ("mug",)
+
+
+def resolved(settings: SceneSettings) -> SceneSettings:
+    """The settings with the defaults filled in that depend on others.
+
+    Raises:
+        InputError: a bad number, or options that contradict each other.
+    """
+    _check_numbers(settings)
+    category = settings.category or categories_of(settings.weights)[0]
+    settings = dataclasses.replace(settings, category=category, weights=settings.weights or category)
+    generated = "random"
+    if isinstance(settings, LandscapeSettings):
+        generated = "given"
+        one = settings.rotation in ("pick", "identity")
+        settings = dataclasses.replace(settings, query=settings.query or ("lattice" if one else "given"))
+    pose = settings.target_pose or (generated if settings.target is None else "given")
+    if settings.demonstration is None:
+        return dataclasses.replace(
+            settings,
+            target_pose=pose,
+            trajectory=settings.trajectory or ("wave" if category == "mug" else "lift_over"),
+            poses=7 if settings.poses is None else settings.poses,
+            queries=128 if settings.queries is None else settings.queries,
+        )
+    for name in ("trajectory", "queries"):
+        if getattr(settings, name) is not None:
+            raise InputError(f"{settings.COMMAND}: --{name} is for a generated demonstration, and there is a file; drop one")
+    return dataclasses.replace(settings, target_pose=pose)
+
+
+def _check_numbers(settings: SceneSettings) -> None:
+    if not 0 <= settings.seed < SEEDS:
+        raise InputError(f"{settings.COMMAND}: --seed is {settings.seed}; expected 0 to {SEEDS - 1}")
+    if settings.target is None and settings.scale != 1:
+        raise InputError(f"{settings.COMMAND}: --scale is for a --target file; give one, or drop --scale")
+    if isinstance(settings, Settings):
+        if settings.k is not None and settings.method == "carry":
+            raise InputError("tdf imitate: --k is a weight of eq. 3, which --method carry does not minimise; drop it, or add --method gauss-newton or adam")
+        if settings.inits is not None and settings.inits < 1:
+            raise InputError(f"tdf imitate: --inits is {settings.inits}; expected at least 1")
+        if settings.k is not None and not 0 <= settings.k < np.inf:
+            raise InputError(f"tdf imitate: --k is {settings.k}; expected a weight of 0 or more")
+        if not np.isfinite(settings.goal_offset).all():
+            raise InputError(f"tdf imitate: --goal-offset is {settings.goal_offset}; expected three finite numbers, metres")
+    if isinstance(settings, LandscapeSettings):
+        for name in ("half", "radius", "pitch"):
+            if not 0 < getattr(settings, name) < np.inf:
+                raise InputError(f"tdf landscape: --{name} is {getattr(settings, name)}; expected a length above 0, metres")
+        if settings.grid != "path" and settings.half < settings.pitch / 2:
+            raise InputError(f"tdf landscape: --half is {settings.half}; expected at least half the pitch of {settings.pitch}: two points a side")
+        if not 0 <= settings.sharpness <= SHARPEST:
+            raise InputError(f"tdf landscape: --sharpness is {settings.sharpness}; expected 0 to {SHARPEST:g}")
+        if settings.grid == "path" and settings.pitch > settings.radius:
+            raise InputError(f"tdf landscape: --pitch is {settings.pitch} and --radius {settings.radius}; expected a pitch of at most the radius")
+        if settings.rotations < 1:
+            raise InputError(f"tdf landscape: --rotations is {settings.rotations}; expected at least 1")

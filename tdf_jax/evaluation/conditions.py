@@ -1,0 +1,43 @@
+"""Conditions under which the new object's cloud is taken: complete, seen by cameras, sparse, noisy, of another size."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from tdf_jax.io.meshes import sample_surface
+from tdf_jax.geometry.views import cameras, visible
+
+if TYPE_CHECKING:
+    import trimesh
+
+VIEWS = {"views1": 1, "views2": 2, "views4": 4}
+SPARSE = {"points300": 300, "points1000": 1000, "points3000": 3000, "noise": 300}
+SCALES = {"half": 0.5, "double": 2.0}
+CONDITIONS = ("full", *VIEWS, *SPARSE, *SCALES)
+NOISE = 0.002  # metres, standard deviation along each axis
+SURFACE = 12_000  # points that cameras look at; the least seen side of a mug shows about an eighth of them
+
+
+def observed(
+    mesh: "trimesh.Trimesh", condition: str, full: Float[np.ndarray, "points 3"], rng: np.random.Generator
+) -> Float[np.ndarray, "seen 3"]:
+    """The cloud of an object under a condition, in the object's frame.
+
+    Args:
+        mesh: the object; of its final size for "half" and "double".
+        condition: one of `CONDITIONS`.
+        full: the complete cloud, returned as it is where the condition is one of size.
+        rng: draws the cameras, points and noise of the others.
+
+    Returns:
+        Points, metres: as many as `full` has where cameras see so many.
+    """
+    if condition in VIEWS:
+        surface = sample_surface(mesh, SURFACE, rng)
+        seen = visible(mesh, surface, cameras(VIEWS[condition], rng), rng).any(axis=0)
+        return surface[seen][: len(full)]
+    if condition in SPARSE:
+        points = sample_surface(mesh, SPARSE[condition], rng)
+        return points + NOISE * rng.standard_normal(points.shape) if condition == "noise" else points
+    return full

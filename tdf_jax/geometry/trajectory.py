@@ -1,0 +1,284 @@
+"""Trajectories of a query frame: resampling, displacing, checks, files."""
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from tdf_jax.geometry import se3
+from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.files import replace_file
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses of the query frame in the world, from the pick (index 0) to the place (the last).
+
+    A pytree of one array, so `jax.vmap` and `jax.grad` go through it. `T_world_query[i]` is pose i:
+    x_world = R_i x_query + t_i.
+
+    Attributes:
+        wxyz_xyz: Poses, quaternion then translation in metres: the layout of `jaxlie.SE3`.
+    """
+
+    wxyz_xyz: Float[Array, "poses 7"]
+
+    @property
+    def poses(self) -> int:
+        """Number of poses."""
+        return self.wxyz_xyz.shape[-2]
+
+    @property
+    def rotations(self) -> Float[Array, "poses 3 3"]:
+        """Rotation matrices."""
+        return se3.rotation(self.wxyz_xyz)
+
+    @property
+    def translations(self) -> Float[Array, "poses 3"]:
+        """Translations, metres."""
+        return se3.translation(self.wxyz_xyz)
+
+    @property
+    def matrices(self) -> Float[Array, "poses 4 4"]:
+        """Homogeneous matrices."""
+        upper = jnp.concatenate([self.rotations, self.translations[..., None]], axis=-1)
+        lower = jnp.broadcast_to(jnp.array([0, 0, 0, 1], upper.dtype), (*upper.shape[:-2], 1, 4))
+        return jnp.concatenate([upper, lower], axis=-2)
+
+    @classmethod
+    def from_matrices(cls, T_world_query: Float[Array, "poses 4 4"]) -> "Trajectory":
+        """Trajectory of homogeneous matrices.
+
+        Args:
+            T_world_query: Rigid transforms, metres.
+
+        Returns:
+            The trajectory.
+
+        Raises:
+            InputError: If the shape is wrong, there are fewer than 2, or one is not rigid or not finite.
+        """
+        T = jnp.asarray(T_world_query)
+        if T.ndim != 3 or T.shape[1:] != (4, 4):
+            raise InputError(f"Trajectory.from_matrices(): matrices have shape {T.shape}; expected (poses, 4, 4).")
+        if not isinstance(T, jax.core.Tracer):
+            if not np.isfinite(T).all():
+                raise InputError("Trajectory.from_matrices(): a matrix is NaN or infinite; expected rigid transforms.")
+            check_rotations("Trajectory.from_matrices", T[:, :3, :3])
+            if not np.allclose(T[:, 3], [0, 0, 0, 1], atol=1e-6):
+                raise InputError("Trajectory.from_matrices(): the last row of a matrix is not 0 0 0 1, as expected.")
+        return check_trajectory(cls(se3.pose(T[:, :3, :3], T[:, :3, 3])))
+
+    def transformed(self, T_new_world: Float[Array, "7"]) -> "Trajectory":
+        """The trajectory carried by a rigid motion of the world: T_new_query = T_new_world T_world_query.
+
+        Args:
+            T_new_world: Pose `wxyz_xyz`.
+
+        Returns:
+            The trajectory in the new frame.
+        """
+        return Trajectory(se3.compose(jnp.asarray(T_new_world), self.wxyz_xyz))
+
+    def shifted(self, offset: Float[Array, "3"]) -> "Trajectory":
+        """The trajectory with a vector, metres, added to every translation."""
+        return Trajectory(jnp.concatenate([self.wxyz_xyz[..., :4], self.translations + jnp.asarray(offset)], axis=-1))
+
+    def displaced(self, offset: Float[Array, "3"], where: Literal["start", "goal"] = "goal") -> "Trajectory":
+        """The trajectory with one end moved; see `displace`."""
+        return displace(self, offset, where)
+
+
+def check_trajectory(trajectory: Trajectory, name: str = "trajectory") -> Trajectory:
+    """Check that a trajectory can be used; nothing is changed.
+
+    Under `jax.jit` only the shape is checked: the values are not known yet.
+
+    Args:
+        trajectory: The trajectory.
+        name: What the message calls it.
+
+    Returns:
+        The same trajectory.
+
+    Raises:
+        InputError: If the shape is not (poses, 7) with at least one pose, a number is not finite, or a quaternion
+            has length zero.
+    """
+    wxyz_xyz = trajectory.wxyz_xyz
+    if not isinstance(wxyz_xyz, jax.Array | np.ndarray):
+        raise InputError(f"check_trajectory(): {name}.wxyz_xyz is a {type(wxyz_xyz).__name__}; expected an array.")
+    if wxyz_xyz.ndim != 2 or wxyz_xyz.shape[1] != 7:
+        raise InputError(f"check_trajectory(): {name}.wxyz_xyz has shape {wxyz_xyz.shape}; expected (poses, 7).")
+    if not jnp.issubdtype(wxyz_xyz.dtype, jnp.floating):
+        raise InputError(f"check_trajectory(): {name} has dtype {wxyz_xyz.dtype}; expected floating point.")
+    if not len(wxyz_xyz):
+        raise InputError(f"check_trajectory(): {name} has no pose; expected at least one.")
+    if not isinstance(wxyz_xyz, jax.core.Tracer):
+        values = np.asarray(wxyz_xyz)
+        finite = np.isfinite(values).all(axis=1)
+        if not finite.all():
+            raise InputError(f"check_trajectory(): pose {np.argmin(finite)} of {name} is NaN or infinite.")
+        lengths = np.linalg.norm(values[:, :4], axis=1)
+        if not (lengths > 1e-6).all():
+            raise InputError(
+                f"check_trajectory(): the quaternion of pose {np.argmin(lengths)} of {name} has length "
+                f"{lengths.min():.1e}; expected w x y z of a rotation, length 1."
+            )
+    return trajectory
+
+
+def resample(trajectory: Trajectory, poses: int) -> Trajectory:
+    """The same path with another number of poses, evenly spaced by the length of the translations' polyline.
+
+    Rotations turn evenly (slerp) between the poses of the original. A path that stays in one place is spaced by
+    its poses instead.
+
+    Args:
+        trajectory: The trajectory.
+        poses: New number of poses, at least 2.
+
+    Returns:
+        The resampled trajectory; its ends are those of the original.
+
+    Raises:
+        InputError: If poses is below 2, the trajectory has one pose, or it fails `check_trajectory`.
+    """
+    check_count("resample", poses)
+    if check_trajectory(trajectory).poses < 2:
+        raise InputError("resample(): the trajectory has one pose; expected at least 2, a way between.")
+    R, t = trajectory.rotations, trajectory.translations
+    steps = jnp.linalg.norm(jnp.diff(t, axis=0), axis=1)
+    steps = jnp.where(steps.sum() > 0, steps, 1.0)
+    length = jnp.concatenate([jnp.zeros(1, steps.dtype), jnp.cumsum(steps)])
+    even = jnp.linspace(0, 1, poses, dtype=length.dtype) * length[-1]
+    i = jnp.clip(jnp.searchsorted(length, even, side="left") - 1, 0, trajectory.poses - 2)
+    fraction = (even - length[i]) / jnp.where(steps[i] > 0, steps[i], 1.0)
+    translations = t[i] + fraction[:, None] * (t[i + 1] - t[i])
+    return Trajectory(se3.pose(se3.geodesic(R[i], R[i + 1], fraction), translations))
+
+
+def displace(
+    trajectory: Trajectory, offset: Float[Array, "3"], where: Literal["start", "goal"] = "goal"
+) -> Trajectory:
+    """The trajectory with one end moved; the other poses stay (the displacements of the paper's table 1).
+
+    Args:
+        trajectory: The trajectory.
+        offset: World vector added to the translation, metres.
+        where: "goal" for the last pose, "start" for the first.
+
+    Returns:
+        The displaced trajectory.
+
+    Raises:
+        InputError: If where is unknown, the offset is not three numbers, or the trajectory fails `check_trajectory`.
+    """
+    if where not in ("start", "goal"):
+        raise InputError(f"displace(): where is {where!r}; expected 'start' or 'goal'.")
+    if not isinstance(offset, jax.core.Tracer):
+        offset = checked_vector("displace", "offset", offset)
+    wxyz_xyz = jnp.asarray(check_trajectory(trajectory).wxyz_xyz)
+    return Trajectory(wxyz_xyz.at[0 if where == "start" else -1, 4:].add(jnp.asarray(offset, wxyz_xyz.dtype)))
+
+
+def save_trajectory(path: str | Path, trajectory: Trajectory) -> None:
+    """Write a trajectory.
+
+    Args:
+        path: A .npz file (array `wxyz_xyz`), or a .tum file (lines `t x y z qx qy qz qw`, t the index in seconds).
+        trajectory: The trajectory.
+
+    Raises:
+        InputError: If the suffix is unknown, the file cannot be written, or the trajectory fails `check_trajectory`.
+    """
+    path = _known_suffix("save_trajectory", path)
+    wxyz_xyz = np.asarray(check_trajectory(trajectory).wxyz_xyz)
+
+    def write(file: BinaryIO) -> None:
+        if path.suffix == ".npz":
+            np.savez(file, wxyz_xyz=wxyz_xyz)
+        else:
+            digits = np.finfo(wxyz_xyz.dtype).precision + 3  # enough to read back the same bits
+            rows = np.column_stack([np.arange(len(wxyz_xyz)), wxyz_xyz[:, [4, 5, 6, 1, 2, 3, 0]]])
+            np.savetxt(file, rows, fmt=f"%.{digits}g", header="t x y z qx qy qz qw")
+
+    replace_file("save_trajectory", path, write)
+
+
+def load_trajectory(path: str | Path) -> Trajectory:
+    """Read a trajectory written by `save_trajectory`, or another program's .tum file.
+
+    Args:
+        path: A .npz or .tum file. In .tum the lines are poses in order, timestamps are not used, # starts a comment.
+
+    Returns:
+        The trajectory.
+
+    Raises:
+        InputError: If the file is missing or unreadable, or its poses fail `check_trajectory`.
+    """
+    path = _known_suffix("load_trajectory", path)
+    if not path.is_file():
+        raise InputError(f"load_trajectory(): there is no file {path}; check the path.")
+    try:
+        wxyz_xyz = _READERS[path.suffix](path)
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        raise InputError(f"load_trajectory(): {path} cannot be read as {path.suffix}: {error}.") from error
+    return check_trajectory(Trajectory(jnp.asarray(wxyz_xyz)), str(path))
+
+
+def _read_npz(path: Path) -> np.ndarray:
+    with path.open("rb") as file, np.lib.npyio.NpzFile(file, allow_pickle=False) as arrays:
+        if "wxyz_xyz" not in arrays:
+            raise ValueError(f"it holds the arrays {list(arrays)}; expected wxyz_xyz")
+        wxyz_xyz = arrays["wxyz_xyz"]
+    if wxyz_xyz.dtype.kind not in "fiu":
+        raise ValueError(f"wxyz_xyz has dtype {wxyz_xyz.dtype}; expected numbers")
+    return wxyz_xyz.astype(np.result_type(wxyz_xyz, np.float32))
+
+
+def _read_tum(path: Path) -> np.ndarray:
+    lines = [line for line in path.read_text().splitlines() if line.split("#")[0].strip()]
+    rows = np.loadtxt(lines, ndmin=2) if lines else np.zeros((0, 8))
+    if rows.shape[1] != 8:
+        raise ValueError(f"it has {rows.shape[1]} columns; expected the 8 of t x y z qx qy qz qw")
+    return rows[:, [7, 4, 5, 6, 1, 2, 3]]
+
+
+_READERS = {".npz": _read_npz, ".tum": _read_tum}
+
+
+def _known_suffix(function: str, path: str | Path) -> Path:
+    path = Path(path)
+    if path.suffix not in _READERS:
+        raise InputError(f"{function}(): {path} has suffix {path.suffix!r}; expected {' or '.join(_READERS)}.")
+    return path
+
+
+def check_count(function: str, poses: int) -> None:
+    """Raise InputError unless there can be so many poses."""
+    if not isinstance(poses, int | np.integer) or poses < 2:
+        raise InputError(f"{function}(): poses is {poses}; expected a whole number of at least 2, pick and place.")
+
+
+def check_rotations(function: str, R: ArrayLike) -> None:
+    """Raise InputError unless all are rotation matrices."""
+    R = np.asarray(R, dtype=np.float64)
+    if not (np.allclose(R @ np.swapaxes(R, -1, -2), np.eye(3), atol=1e-3) and (np.linalg.det(R) > 0).all()):
+        raise InputError(f"{function}(): a rotation matrix is not orthonormal with determinant 1, or not finite.")
+
+
+def checked_vector(function: str, name: str, value: ArrayLike) -> np.ndarray:
+    """Three finite numbers as float64, or InputError."""
+    vector = np.asarray(value, dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise InputError(f"{function}(): {name} is {value}; expected three finite numbers, metres.")
+    return vector

@@ -1,0 +1,55 @@
+"""The descriptor field of one object: every point of space has an occupancy and a descriptor."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from tdf_jax._internal.errors import InputError
+from tdf_jax.networks.occupancy import NORM_FLOOR, Conditioned, decode
+
+
+@functools.partial(jax.tree_util.register_dataclass, data_fields=["conditioned", "origin"], meta_fields=[])
+@dataclasses.dataclass(frozen=True)
+class DescriptorField:
+    """f(x | P) of Neural Descriptor Fields: a conditioned decoder, and where its object is.
+
+    Attributes:
+        conditioned: the decoder folded onto the object's latent.
+        origin: mean of the points it was encoded from, (3,), metres, world frame; the object frame has the world's axes.
+    """
+
+    conditioned: Conditioned
+    origin: Float[Array, "3"]
+
+    @property
+    def latent(self) -> Float[Array, "latent 3"]:
+        """The latent z; its vectors turn with the cloud."""
+        return self.conditioned.latent
+
+    def descriptors(self, x: Float[Array, "*batch 3"]) -> Float[Array, "*batch channels"]:
+        """Point descriptors, of unit length.
+
+        Args:
+            x: points, metres, world frame.
+        """
+        activations, _ = self._decode("descriptors", x)
+        descriptor = jnp.concatenate(activations, axis=-1)
+        # |p|^2 and fc_in are never all zero together in a trained network, so the square root is differentiable where it matters.
+        return descriptor / jnp.maximum(jnp.sqrt(jnp.sum(descriptor**2, axis=-1, keepdims=True)), NORM_FLOOR)
+
+    def occupancy(self, x: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
+        """Probability that points lie inside the object, in [0, 1].
+
+        Args:
+            x: points, metres, world frame.
+        """
+        return jax.nn.sigmoid(self._decode("occupancy", x)[1])
+
+    def _decode(self, function, x):
+        x = jnp.asarray(x)
+        if x.shape[-1:] != (3,):
+            raise InputError(f"DescriptorField.{function}(): x has shape {x.shape}; expected (..., 3), metres")
+        return decode(self.conditioned, x - self.origin)

@@ -1,0 +1,226 @@
+"""Damped Gauss-Newton steps on single poses, each with the waypoint that it is to match.
+
+A step solves (H + damping diag(H)) delta = -gradient for each pose. The gradient is the energy's own; H is that of the absolute values
+replaced by r^2 / (2 max(|r|, s)), with s the mean |r| of the query point: iteratively reweighted least squares, made less steep near zero.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from tdf_jax._internal import devices
+from tdf_jax.geometry import se3 as poses
+from tdf_jax.energy.reference import Reference
+from tdf_jax.energy.losses import pose_difference
+from tdf_jax._internal.precision import full_precision
+
+LARGEST_TURN, LARGEST_MOVE = 0.7, 0.05  # radians and metres of one step
+DAMPINGS = 1e-3, 1e3  # least and greatest
+ACCEPTED, REJECTED = 0.3, 4.0  # factors on the damping
+LEAST_DIFFERENCE = 1e-4  # metres; the curvature of eq. 3's norm grows without bound towards zero: that of no smaller difference is taken
+
+
+class Problem(NamedTuple):
+    """What poses are to match, with the query points in blocks: a stage sees the first, or all.
+
+    Attributes:
+        query: relative to their mean, (blocks, size, 3), metres.
+        weights: 1, or 0 for what fills up the last block, (blocks, size).
+        descriptors: the demonstration's.
+        target: waypoints of the reference, `wxyz_xyz`, relative to the object's origin.
+        centre: mean of the query points, in the query frame.
+    """
+
+    query: Float[Array, "blocks size 3"]
+    weights: Float[Array, "blocks size"]
+    descriptors: Float[Array, "waypoints blocks size channels"]
+    target: Float[Array, "waypoints 7"]
+    centre: Float[Array, "3"]
+
+
+@functools.partial(jax.jit, compiler_options=devices.ONCE)
+def in_blocks(reference: Reference, order: Int[Array, "blocks size"], counts: Bool[Array, "blocks size"]) -> Problem:
+    """A reference's query points in blocks.
+
+    Args:
+        reference: the demonstration's.
+        order: numbers of the query points.
+        counts: where False, one only fills up the last block.
+    """
+    query, descriptors = reference.query, reference.descriptors
+    centre = jnp.mean(query, axis=0)
+    return Problem(
+        query=(query - centre)[order],
+        weights=counts.astype(query.dtype),
+        descriptors=descriptors[:, order],
+        target=reference.trajectory.wxyz_xyz,
+        centre=centre,
+    )
+
+
+class _State(NamedTuple):
+    """Poses, each apart from the others, with its energy and the quadratic model of it.
+
+    `gradient` and `hessian` are with respect to a turn about the query points' mean (on the left) and a move.
+    """
+
+    R: Float[Array, "poses 3 3"]
+    place: Float[Array, "poses 3"]
+    energy: Float[Array, "poses"]
+    gradient: Float[Array, "poses 6"]
+    hessian: Float[Array, "poses 6 6"]
+
+
+@functools.partial(jax.jit, static_argnames=("length", "chunk", "mesh"))
+def descend(R, place, waypoint, bounds, damping, tolerance, field, problem, energy, *, length, chunk, mesh=None):
+    """Damped Gauss-Newton steps, until none promises to gain by the tolerance.
+
+    Args:
+        R, place: rotations of the query frame in the world, (poses, 3, 3), and places of the query points' mean, (poses, 3), metres.
+        waypoint: of each pose, what it is to match.
+        bounds: how many of the poses move, how many are evaluated, blocks of query points, most steps.
+        damping: of the first step.
+        tolerance: share of a pose's energy that its next step has to promise; where none does, all end.
+        field, problem, energy: what is minimised.
+        length: times a history has room for.
+        chunk: query points evaluated at a time.
+        mesh: devices that the poses are dealt out to in turns.
+
+    Returns:
+        R, place, and energies at the start and after each step, (poses, length); those of steps that were not taken are the latest.
+    """
+    work = functools.partial(_steps, length=length, chunk=chunk, axes=mesh.axis_names if mesh is not None else ())
+    if mesh is not None:
+        split = devices.split(mesh)
+        work = jax.shard_map(work, mesh=mesh, in_specs=(*[split] * 3, *[devices.WHOLE] * 6), out_specs=split, check_vma=False)
+    return work(R, place, waypoint, bounds, damping, tolerance, field, problem, energy)
+
+
+@full_precision
+def _steps(R, place, waypoint, bounds, damping, tolerance, field, problem, energy, *, length, chunk, axes):
+    """`descend` on one device; `axes` are the mesh's."""
+    if axes:
+        parts, part = jax.lax.axis_size(axes), jax.lax.axis_index(axes)
+        bounds = bounds.at[:2].set((bounds[:2] - part + parts - 1) // parts)  # of the poses dealt out, those of this device
+    moving, _, _, steps = bounds
+    moves = jnp.arange(len(R)) < moving
+
+    def body(carry):
+        i, state, damping, step, _, history = carry
+        R, place = poses.multiply(poses.exp(step[:, :3]), state.R), state.place + step[:, 3:]
+        trial = _State(R, place, *_evaluate(R, place, waypoint, bounds, field, problem, energy, chunk))
+        # The first time nothing has moved and the state's energies are infinite: it takes what is finite.
+        better = trial.energy < state.energy
+        state = jax.tree.map(lambda a, b: jnp.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b), trial, state)
+        factor = jnp.where(i == 0, 1.0, jnp.where(better, ACCEPTED, REJECTED))
+        damping = jnp.clip(damping * factor, *DAMPINGS)
+        step, promise = _step(state, damping)
+        hopeful = jnp.any(moves & (promise > tolerance * state.energy))
+        hopeful = jax.lax.pmax(hopeful.astype(jnp.int32), axes) > 0 if axes else hopeful
+        history = jnp.where(jnp.arange(length) >= i, state.energy[:, None], history)
+        return i + 1, state, damping, jnp.where(moves[:, None], step, 0.0), hopeful, history
+
+    count, dtype = len(R), R.dtype
+    values = jnp.full(count, jnp.inf, dtype), jnp.zeros((count, 6), dtype), jnp.broadcast_to(jnp.eye(6, dtype=dtype), (count, 6, 6))
+    begin = _State(R, place, *values), jnp.full(count, damping, dtype), jnp.zeros((count, 6), dtype)
+    carry = (jnp.int32(0), *begin, jnp.bool_(True), jnp.zeros((count, length), dtype))
+    _, state, _, _, _, history = jax.lax.while_loop(lambda carry: (carry[0] <= steps) & carry[4], body, carry)
+    return state.R, state.place, history
+
+
+def _step(state, damping):
+    """The next step of every pose, (poses, 6), and by how much its quadratic model falls."""
+    diagonal = jnp.diagonal(state.hessian, axis1=1, axis2=2)
+    # Far from the object a field is flat: the floor keeps the system solvable.
+    damped = state.hessian + (damping[:, None] * diagonal + 1e-9)[:, :, None] * jnp.eye(6, dtype=diagonal.dtype)
+    step = -_solved(damped, state.gradient)
+    turn, move = (jnp.linalg.norm(part, axis=-1) for part in (step[:, :3], step[:, 3:]))
+    longest = jnp.maximum(jnp.maximum(turn / LARGEST_TURN, move / LARGEST_MOVE), 1.0)
+    step = step / longest[:, None]
+    curved = jnp.sum(step * jnp.sum(state.hessian * step[:, None], axis=-1), axis=-1)
+    return step, -jnp.sum(state.gradient * step, axis=-1) - curved / 2
+
+
+def _solved(matrix, right):
+    """Solutions of positive definite systems (poses, 6, 6), by elimination; no pivots are needed."""
+
+    def eliminate(k, system):
+        row = system[:, k] / system[:, k, k][:, None]
+        return (system - system[:, :, k, None] * row[:, None]).at[:, k].set(row)
+
+    return jax.lax.fori_loop(0, 6, eliminate, jnp.concatenate([matrix, right[..., None]], axis=-1))[..., -1]
+
+
+def _evaluate(R, place, waypoint, bounds, field, problem, energy, chunk):
+    """Energies of the poses within the bounds and their quadratic models: (poses,), (poses, 6), (poses, 6, 6)."""
+    _, last, blocks, _ = bounds
+    count = min(max(1, chunk // problem.query.shape[1]), len(R))
+    used = jnp.sum(jnp.where(jnp.arange(len(problem.weights)) < blocks, jnp.sum(problem.weights, axis=1), 0.0))
+
+    def some(j, values):
+        # The last chunk begins early rather than run over the end.
+        begin = jnp.minimum(j * count, len(R) - count)
+        R_, place_, waypoint_ = (jax.lax.dynamic_slice_in_dim(part, begin, count) for part in (R, place, waypoint))
+
+        def block(b, total):
+            terms = _match(R_, place_, field, problem.query[b], problem.weights[b] / used, problem.descriptors[waypoint_, b])
+            return jax.tree.map(jnp.add, total, terms)
+
+        total = jax.lax.fori_loop(0, blocks, block, tuple(jnp.zeros_like(part[:count]) for part in values))
+        return jax.tree.map(lambda whole, part: jax.lax.dynamic_update_slice_in_dim(whole, part, begin, 0), values, total)
+
+    values = tuple(jnp.zeros((len(R), *shape), R.dtype) for shape in ((), (6,), (6, 6)))
+    values = jax.lax.fori_loop(0, (last + count - 1) // count, some, values)
+    prior = jax.vmap(lambda R, place, target: _prior(R, place, target, field.origin, problem.centre, energy))
+    return jax.tree.map(jnp.add, values, prior(R, place, problem.target[waypoint]))
+
+
+def _match(R, place, field, query, weights, shown):
+    """Weighted sums over query points of the mean absolute difference of descriptors, its gradient and its model's curvature."""
+    arm = poses.rotate(R, query)
+    x = (arm + place[:, None]).reshape(-1, 3)
+
+    def along(axis):
+        return jax.jvp(field.descriptors, (x,), (jnp.broadcast_to(axis, x.shape),))
+
+    found, tangents = jax.vmap(along, out_axes=(None, 1))(jnp.eye(3, dtype=x.dtype))  # (points, channels), (points, 3, channels)
+    residual = found - shown.reshape(found.shape)
+    size = jnp.abs(residual)
+    mean = jnp.mean(size, axis=-1)
+    weights = jnp.tile(weights, len(R))
+    share = (weights / size.shape[-1])[:, None]
+    slope = jnp.einsum("pic,pc->pi", tangents, jnp.sign(residual) * share)
+    weighted = tangents * (share / jnp.maximum(jnp.maximum(size, mean[:, None]), 1e-9))[:, None]
+    curvature = jnp.einsum("pic,pjc->pij", tangents, weighted)
+
+    slope, curvature = slope.reshape(*arm.shape[:2], 3), curvature.reshape(*arm.shape[:2], 3, 3)
+    # A turn w moves a point by w x arm, a move v by v: rows of the jacobian (poses, size, 6, 3).
+    identity = jnp.broadcast_to(jnp.eye(3, dtype=x.dtype), curvature.shape)
+    jacobian = jnp.concatenate([jnp.cross(identity, arm[..., None, :]), identity], axis=-2)
+    gradient = jnp.einsum("pqai,pqi->pa", jacobian, slope)
+    hessian = jnp.einsum("pqai,pqbi->pab", jacobian, jacobian @ curvature)
+    return jnp.sum((weights * mean).reshape(arm.shape[:2]), axis=1), gradient, hessian
+
+
+def _prior(R, place, target, origin, centre, energy):
+    """One pose's weighted part of eq. 3, its gradient and its model's curvature."""
+
+    def difference(R, place):
+        return pose_difference(R, place - R @ centre, origin, target, energy.lever, energy.pose_norm)
+
+    # Along a turn about each axis, which changes R by axis x R, and a move along each.
+    identity, zeros = jnp.eye(3, dtype=R.dtype), jnp.zeros((3, 3), R.dtype)
+    turns = jnp.cross(identity[:, None], R.T[None]).swapaxes(1, 2)
+    along = jnp.concatenate([turns, jnp.zeros_like(turns)]), jnp.concatenate([zeros, identity])
+    value, rows = jax.vmap(lambda *step: jax.jvp(difference, (R, place), step), out_axes=(None, 0))(*along)
+    if energy.pose_norm == "mean_absolute":
+        length, share = jnp.abs(value), energy.correlation / len(value)
+        loss = share * jnp.sum(length)
+    else:
+        length, share = jnp.sqrt(jnp.sum(value * value)), energy.correlation
+        loss = share * length
+    weighted = rows * (share / jnp.maximum(length, LEAST_DIFFERENCE))
+    return loss, weighted @ value, weighted @ rows.T

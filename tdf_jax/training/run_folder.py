@@ -1,0 +1,85 @@
+"""The folder of a run: its settings, its metrics as JSON lines, its checkpoint. What a kill leaves can be gone on from."""
+
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+from flax import serialization
+
+from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.files import replace_file
+
+CONFIG, METRICS, STATE = "config.json", "metrics.jsonl", "state.msgpack"
+
+
+def claim(directory: Path, settings: dict) -> None:
+    """Write the run's settings, or compare them with what stands there: only `steps` may differ.
+
+    Raises:
+        InputError: the folder holds a run with other settings, or cannot be written.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"train(): cannot make the folder {directory} ({error}); expected a writable place") from None
+    old = settings_of(directory)
+    changed = [] if old is None else [name for name in settings if name != "steps" and old.get(name) != settings[name]]
+    if changed:
+        raise InputError(
+            f"train(): {directory} holds a run with other settings ({', '.join(changed)}); expected the same. "
+            "Choose another directory, or delete this one."
+        )
+    replace_file("train", directory / CONFIG, json.dumps(settings, indent=1).encode())
+
+
+def settings_of(directory: Path) -> dict | None:
+    """Settings of the run that stands in a folder, if one does."""
+    path = directory / CONFIG
+    return _read(path, lambda content: dict(json.loads(content))) if path.exists() else None
+
+
+def save(directory: Path, params, state, step: int) -> None:
+    """Write the checkpoint."""
+    replace_file("train", directory / STATE, serialization.to_bytes({"params": params, "state": state, "step": step}))
+
+
+def restore(directory: Path, params, state) -> tuple:
+    """Parameters, the optimiser's state and the step of the checkpoint; what was given, and 0, where there is none."""
+    path = directory / STATE
+    if not path.exists():
+        return params, state, 0
+    target = {"params": params, "state": state, "step": 0}
+    saved = jax.tree.map(jnp.asarray, _read(path, lambda content: serialization.from_bytes(target, content)))
+    shapes = [[leaf.shape for leaf in jax.tree.leaves(tree)] for tree in (target["params"], saved["params"])]
+    if shapes[0] != shapes[1]:
+        raise InputError(f"train(): {path} is a checkpoint of another network; expected one of these settings. Choose another directory.")
+    return saved["params"], saved["state"], int(saved["step"])
+
+
+def metrics(directory: Path) -> list[dict]:
+    """The rows of a run's metrics; a line that a kill cut short is left out."""
+    path = directory / METRICS
+    rows = (_row(line) for line in path.read_text().splitlines()) if path.exists() else ()
+    return [row for row in rows if row is not None]
+
+
+def drop_later_metrics(directory: Path, step: int) -> None:
+    """A run killed after its last checkpoint repeats some steps; their first lines go."""
+    rows = [row for row in metrics(directory) if row["step"] <= step]
+    replace_file("train", directory / METRICS, "".join(json.dumps(row) + "\n" for row in rows).encode())
+
+
+def _row(line):
+    try:
+        return json.loads(line)
+    except json.JSONDecodeError:
+        return None
+
+
+def _read(path, parse):
+    try:
+        return parse(path.read_bytes())
+    except Exception as error:  # damaged files raise whatever their parser stumbles on
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"train(): {path} cannot be read ({reason}): damaged, or of another version; delete the folder, or restore the file") from None

@@ -1,0 +1,90 @@
+"""Figures of an imitation, in matplotlib and without its global state: each function returns a `Figure`."""
+
+from typing import TYPE_CHECKING
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from tdf_jax.energy.reference import Demonstration
+from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.viz.style import CLOUD, COLOURS, STYLE, blank_figure, legend_of
+from tdf_jax.viz.scene3d import View, bounds, content, draw, frame, triangles_of, waypoint_bar
+
+if TYPE_CHECKING:
+    import trimesh
+
+
+def imitation_figure(
+    demonstration: Demonstration,
+    points: Float[np.ndarray, "points 3"],
+    trajectory: Trajectory,
+    expected: Trajectory | None = None,
+    meshes: "tuple[trimesh.Trimesh | None, trimesh.Trimesh | None]" = (None, None),
+    title: str = "",
+) -> Figure:
+    """Reference and test side by side, as in figure 4 of the paper.
+
+    Args:
+        demonstration: the reference.
+        points: the test object's cloud, metres, world frame.
+        trajectory: found on the test object.
+        expected: the true one, drawn dashed.
+        meshes: of the reference's and the test's object, metres, world frame; drawn instead of the points.
+        title: above both.
+
+    Returns:
+        The figure; its axes are the reference, the test and the colour bar.
+    """
+    box = bounds(np.asarray(demonstration.query))
+    triangles = [triangles_of(mesh) for mesh in meshes]
+    views = {
+        "reference": View(np.asarray(demonstration.points), triangles[0], demonstration.trajectory),
+        "test": View(np.asarray(points), triangles[1], trajectory, expected),
+    }
+    contents = [content(view, box) for view in views.values()]
+    size = np.max([np.ptp(one, axis=0) for one in contents], axis=0) * 1.06
+    with matplotlib.rc_context(STYLE):
+        figure = blank_figure(7.2, 4.5)
+        legend = {}
+        for column, (name, view) in enumerate(views.items()):
+            axes = figure.add_axes((0.5 * column - 0.005, 0.17, 0.46, 0.74), projection="3d")
+            draw(axes, view, box)
+            frame(axes, contents[column], size)
+            axes.set_title(name, y=0.99)
+            legend |= legend_of(axes)
+        waypoint_bar(figure, trajectory.poses, (0.62, 0.085, 0.3, 0.025))
+        placing = {"loc": "lower left", "bbox_to_anchor": (0.02, 0.0), "frameon": False}
+        figure.legend(legend.values(), legend.keys(), **placing)
+        figure.suptitle(title, y=0.98)
+    return figure
+
+
+def loss_figure(losses: Float[np.ndarray, "inits iterations"], best: int, title: str = "", rows: str = "start") -> Figure:
+    """Loss against iteration of every start, as in figure 5 of the paper.
+
+    Args:
+        losses: energies; a start that became non-finite ends there.
+        best: the start drawn bold.
+        title: above.
+        rows: what a row is called; the solver's are candidates.
+    """
+    losses = np.asarray(losses)
+    steps = np.arange(losses.shape[1])
+    with matplotlib.rc_context(STYLE):
+        figure = blank_figure(4.8, 3.2, layout="constrained")
+        axes = figure.add_subplot()
+        for index, row in enumerate(losses):
+            if index != best:
+                axes.plot(steps, row, color=CLOUD, lw=0.7, alpha=0.8, label=f"other {rows}s")
+        axes.plot(steps, losses[best], color=COLOURS(0.35), lw=2.0, label=f"best, {rows} {best + 1} of {len(losses)}")
+        legend = legend_of(axes)
+        axes.legend(legend.values(), legend.keys(), frameon=False)
+        axes.set(xlabel="iteration", ylabel="loss (no unit)", title=title, xlim=(0, max(1, steps[-1])))
+        axes.set_ylim(bottom=0)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(alpha=0.25, lw=0.5)
+    return figure

@@ -1,0 +1,321 @@
+"""Pictures of energy landscapes: maps of planes, surfaces of equal energy in volumes, an animated slice, and a page to turn by hand."""
+
+import dataclasses
+import io
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float
+from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.figure import Figure
+
+from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.files import replace_file
+from tdf_jax.landscape.storage import Landscape
+from tdf_jax.io.meshes import libigl
+from tdf_jax.viz import polygons3d as solid
+from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, LIGHT, STYLE, TRUTH, blank_figure, legend_of
+
+if TYPE_CHECKING:
+    import trimesh
+
+COLUMNS = 4
+PANEL = 1.75  # inches
+CONTOURS = 12
+NEAR = 1.5  # steps off the plane within which an object's points are drawn on a map
+LEVELS = (0.02, 0.10)  # shares of a volume that lie within its surfaces of equal energy
+SURFACES = COLOURS(0.15), COLOURS(0.75)
+SEE_THROUGH = 0.30
+PANELS = 24  # of waypoints on a map; of more, so many evenly spread
+FRAMES_A_SECOND = 8
+GIF_DPI = 100
+SHOWN = 1500  # points of an object's cloud
+ANGLES = {"elev": 22, "azim": -38}
+
+
+@dataclasses.dataclass(frozen=True)
+class Marks:
+    """What is drawn on a landscape, metres, world frame.
+
+    Attributes:
+        points: the object's cloud.
+        mesh: its surface, if known; drawn in volumes instead of the points.
+        expected: where the waypoints ought to be, if known.
+        path: the lowest-cost path, if there is one.
+    """
+
+    points: Float[np.ndarray, "points 3"]
+    mesh: "trimesh.Trimesh | None" = None
+    expected: Float[np.ndarray, "poses 3"] | None = None
+    path: Float[np.ndarray, "corners 3"] | None = None
+
+
+def map_figure(landscape: Landscape, marks: Marks, title: str = "") -> Figure:
+    """A plane: the combined energy, then every waypoint's, with contours, minimisers and paths.
+
+    Args:
+        landscape: of a grid with two axes, in one orientation or the best of several.
+        marks: what to draw on it.
+        title: over the picture.
+
+    Raises:
+        InputError: the grid has one or three axes, or each rotation was kept.
+    """
+    _check("map_figure", landscape, axes=2)
+    shown = np.unique(np.linspace(0, len(landscape.values) - 1, PANELS).round().astype(int))
+    panels = {"all waypoints": landscape.combined} | {f"waypoint {index}": landscape.values[index] for index in shown}
+    columns = min(COLUMNS, len(panels))
+    rows = -(-len(panels) // columns)
+    first, second = (CENTIMETRES * steps for steps in landscape.grid.coordinates)
+    height = PANEL * (np.ptp(second) / np.ptp(first))
+    low, high = np.nanmin(landscape.values), np.nanquantile(landscape.values, 0.99)
+    with matplotlib.rc_context(STYLE):
+        figure = blank_figure(PANEL * columns + 0.6, (height + 0.1) * rows + 0.9, layout="constrained")
+        grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+        for axes in grid.flat[len(panels) :]:
+            axes.remove()
+        for index, (axes, (name, energy)) in enumerate(zip(grid.flat, panels.items())):
+            picture = _map(axes, first, second, energy, low, high)
+            chosen = slice(None) if index == 0 else shown[index - 1 : index]
+            _mark(axes, landscape, marks, chosen, whole=index == 0)
+            axes.set_title(name)
+        names = [_axis_name(direction) for direction in landscape.grid.directions]
+        for index in range(len(panels)):
+            if index + columns >= len(panels):
+                grid.flat[index].set_xlabel(f"{names[0]} from the middle (cm)")
+            if index % columns == 0:
+                grid.flat[index].set_ylabel(f"{names[1]} from the middle (cm)")
+        figure.colorbar(picture, ax=list(grid.flat[: len(panels)]), label="energy (no unit)", shrink=0.8, pad=0.01)
+        legend = legend_of(grid[0, 0])
+        figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=4, facecolor=COLOURS(0.45), labelcolor="white")
+        figure.suptitle(title)
+    return figure
+
+
+def isosurface_figure(landscape: Landscape, marks: Marks, title: str = "") -> Figure:
+    """A volume: the surfaces within which the combined energy is among the least 2 % and 10 %, with the object and the paths.
+
+    Args:
+        landscape: of a grid with three axes, in one orientation or the best of several.
+        marks: what to draw with it.
+        title: over the picture.
+
+    Raises:
+        InputError: the grid has one or two axes, each rotation was kept, or libigl is not installed.
+    """
+    _check("isosurface_figure", landscape, axes=3)
+    with matplotlib.rc_context(STYLE):
+        figure = blank_figure(6.5, 5.6)
+        axes = figure.add_axes((0.0, 0.12, 1.0, 0.84), projection="3d")
+        pieces = solid.Pieces([], [], [])
+        if marks.mesh is not None:
+            pieces += solid.surface(CENTIMETRES * np.asarray(marks.mesh.triangles), LIGHT)
+        else:
+            axes.scatter(*(CENTIMETRES * marks.points[:: max(1, len(marks.points) // SHOWN)].T), s=1.5, color=CLOUD, linewidths=0)
+        for share, colour in zip(LEVELS, SURFACES):
+            triangles = CENTIMETRES * isosurface(landscape, share)
+            count = len(triangles)
+            pieces += solid.Pieces(list(triangles), [(*colour[:3], SEE_THROUGH)] * count, [(*colour[:3], 0.0)] * count)
+            axes.plot([], [], [], color=colour, lw=6, alpha=2 * SEE_THROUGH, label=f"least {100 * share:.0f} % of the volume")
+        axes.add_collection3d(pieces.collection())
+        for points, style in _paths(landscape, marks, CLOUD):
+            axes.plot(*(CENTIMETRES * points.T), zorder=10, **style)
+        corners = CENTIMETRES * landscape.grid.points[:: landscape.grid.shape[0] - 1, :: landscape.grid.shape[1] - 1, :: landscape.grid.shape[2] - 1]
+        low, high = corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]), xlabel="x (cm)", ylabel="y (cm)", zlabel="z (cm)")
+        axes.set_box_aspect(high - low, zoom=1.1)
+        axes.view_init(**ANGLES)
+        legend = legend_of(axes)
+        figure.legend(legend.values(), legend.keys(), loc="lower center", ncols=3, frameon=False)
+        figure.suptitle(title)
+    return figure
+
+
+def isosurface(landscape: Landscape, share: float) -> Float[np.ndarray, "faces 3 3"]:
+    """The surface within which the combined energy is least, by marching cubes.
+
+    Args:
+        landscape: of a volume.
+        share: of the points that count, which lie within it.
+
+    Returns:
+        Triangles, metres, world frame.
+    """
+    igl = libigl("isosurface()")
+    energy = landscape.combined
+    level = float(np.nanquantile(energy, share))
+    # Where points do not count nothing is drawn: they are as high as the highest.
+    values = np.nan_to_num(energy, nan=np.nanmax(energy)).astype(float)
+    points = landscape.grid.points.transpose(2, 1, 0, 3).reshape(-1, 3)  # the first axis runs fastest
+    vertices, faces, _ = igl.marching_cubes(values.transpose(2, 1, 0).ravel(), points, *landscape.grid.shape, level)
+    return np.asarray(vertices)[np.asarray(faces)].reshape(-1, 3, 3)
+
+
+def save_slices(path: str | os.PathLike, landscape: Landscape, marks: Marks) -> None:
+    """Write an animated .gif: the combined energy of a volume, slice by slice along its third axis.
+
+    Args:
+        path: the file; it appears only once it is whole.
+        landscape: of a grid with three axes, in one orientation or the best of several.
+        marks: what to draw on it; of the object, the points near each slice.
+
+    Raises:
+        InputError: the grid has one or two axes, each rotation was kept, or the file cannot be written.
+    """
+    _check("save_slices", landscape, axes=3)
+    grid, energy = landscape.grid, landscape.combined
+    first, second, heights = (CENTIMETRES * steps for steps in grid.coordinates)
+    local = CENTIMETRES * (marks.points - grid.origin) @ grid.directions.T
+    low, high = np.nanmin(energy), np.nanquantile(energy, 0.99)
+    names = [_axis_name(direction) for direction in grid.directions]
+    with matplotlib.rc_context(STYLE):
+        figure = blank_figure(4.6, 4.2, layout="constrained")
+        axes = figure.subplots()
+        figure.colorbar(matplotlib.cm.ScalarMappable(matplotlib.colors.Normalize(low, high), COLOURS), ax=axes, label="energy (no unit)")
+
+        def draw(index):
+            axes.clear()
+            _map(axes, first, second, energy[:, :, index], low, high)
+            near = np.abs(local[:, 2] - heights[index]) < NEAR * (heights[1] - heights[0])
+            axes.scatter(*local[near, :2].T, s=3, color="white", linewidths=0)
+            for points, style in _paths(landscape, marks):
+                place = CENTIMETRES * (points - grid.origin) @ grid.directions.T
+                here = np.abs(place[:, 2] - heights[index]) < NEAR * (heights[1] - heights[0])
+                axes.plot(*place[here, :2].T, **(style | {"ls": "", "marker": style.get("marker", ".")}))
+            axes.set(xlabel=f"{names[0]} from the middle (cm)", ylabel=f"{names[1]} from the middle (cm)", title=f"{names[2]} {heights[index]:+.1f} cm from the middle")
+
+        animation = FuncAnimation(figure, draw, frames=len(heights), init_func=lambda: ())
+        path = Path(path)
+        part = path.with_name(f".{path.stem}.part.gif")  # the writer wants a name that ends in .gif
+        try:
+            animation.save(part, writer=PillowWriter(fps=FRAMES_A_SECOND), dpi=GIF_DPI)
+            replace_file("save_slices", path, part.read_bytes())
+        except OSError as error:
+            raise InputError(f"save_slices(): cannot write {path} ({error}); expected a writable file in an existing folder") from None
+        finally:
+            part.unlink(missing_ok=True)
+
+
+def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title: str = "") -> None:
+    """Write an .html page that opens without a network: a plane as a surface of energies, a volume as surfaces of equal energy, to turn, zoom
+    and read numbers from.
+
+    Args:
+        path: the file; it appears only once it is whole.
+        landscape: of a grid with two or three axes, in one orientation or the best of several.
+        marks: what to draw with it.
+        title: of the page.
+
+    Raises:
+        InputError: the grid has one axis, each rotation was kept, plotly (or, for a volume, libigl) is not installed, or the file cannot
+            be written.
+    """
+    plotly = pages("save_page()")
+    grid = landscape.grid
+    _check("save_page", landscape, axes=len(grid.shape) if len(grid.shape) > 1 else 2)
+    energy, points = landscape.combined, CENTIMETRES * grid.points
+    scale = {"colorscale": "Viridis", "colorbar": {"title": "energy"}}
+    if energy.ndim == 2:
+        x, y, z = np.moveaxis(points, -1, 0)
+        drawn = [plotly.Surface(x=x, y=y, z=z, surfacecolor=energy, opacity=0.85, name="energy", **scale)]
+    else:
+        drawn = []
+        # Surfaces of our own: plotly's know only grids along its axes.
+        for share, colour in zip(LEVELS, SURFACES):
+            x, y, z = CENTIMETRES * isosurface(landscape, share).reshape(-1, 3).T
+            i, j, k = np.arange(len(x)).reshape(-1, 3).T
+            name = f"energy {np.nanquantile(energy, share):.4f}: least {100 * share:.0f} %"
+            look = {"color": matplotlib.colors.to_hex(colour), "opacity": SEE_THROUGH, "name": name, "showlegend": True}
+            drawn.append(plotly.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, **look))
+    if marks.mesh is not None:
+        x, y, z = CENTIMETRES * np.asarray(marks.mesh.vertices).T
+        i, j, k = np.asarray(marks.mesh.faces).T
+        drawn.append(plotly.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, color=matplotlib.colors.to_hex(solid.CLAY), name="object", showlegend=True))
+    else:
+        x, y, z = CENTIMETRES * marks.points[:: max(1, len(marks.points) // SHOWN)].T
+        drawn.append(plotly.Scatter3d(x=x, y=y, z=z, mode="markers", marker={"size": 1.5, "color": CLOUD}, name="object"))
+    for line, style in _paths(landscape, marks, CLOUD):
+        x, y, z = CENTIMETRES * line.T
+        mode = "markers" if style.get("ls") == "" else "lines+markers"
+        look = {"line": {"color": style["color"], "width": 5}, "marker": {"size": 3, "color": style["color"]}}
+        drawn.append(plotly.Scatter3d(x=x, y=y, z=z, mode=mode, name=style["label"], **look))
+    figure = plotly.Figure(drawn)
+    ends = {f"{axis}axis": {"title": f"{axis} (cm)"} for axis in "xyz"}
+    azimuth, height = np.radians(ANGLES["azim"]), np.radians(ANGLES["elev"])
+    eye = 2.6 * np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
+    scene = ends | {"aspectmode": "data", "camera": {"eye": dict(zip("xyz", eye.tolist()))}}
+    figure.update_layout(title=title, scene=scene, legend={"x": 0, "y": 1}, margin={"l": 0, "r": 0, "b": 0, "t": 40})
+    page = io.StringIO()
+    figure.write_html(page, include_plotlyjs=True, full_html=True, default_height="95vh")
+    replace_file("save_page", Path(path), page.getvalue().encode())
+
+
+def pages(function: str):
+    """The plotly module that draws pages.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        import plotly.graph_objects
+    except ImportError:
+        raise InputError(f"{function}: plotly is not installed; expected it for pages: pip install 'tdf_jax[pages]'") from None
+    return plotly.graph_objects
+
+
+def _check(function, landscape, axes):
+    if len(landscape.grid.shape) != axes:
+        raise InputError(f"{function}(): the grid has {len(landscape.grid.shape)} axes; expected {axes}")
+    if landscape.turned is None:
+        raise InputError(f"{function}(): the landscape keeps each rotation's energies; expected the best, or one rotation's")
+
+
+def _map(axes, first, second, energy, low, high):
+    picture = axes.pcolormesh(first, second, energy.T, cmap=COLOURS, vmin=low, vmax=high, shading="nearest", rasterized=True)
+    if np.isfinite(energy).any() and np.nanmax(energy) > low:
+        axes.contour(first, second, energy.T, levels=np.linspace(low, high, CONTOURS + 1), colors="white", linewidths=0.3, alpha=0.7)
+    axes.set_aspect("equal")
+    axes.set(xlim=(first[0], first[-1]), ylim=(second[0], second[-1]))
+    return picture
+
+
+def _mark(axes, landscape, marks, chosen, whole):
+    """Marks on a map: the object's points near the plane, and what lies in it, projected."""
+    grid = landscape.grid
+
+    def flat(points):
+        return CENTIMETRES * ((points - grid.origin) @ grid.directions.T).T
+
+    offsets = marks.points - grid.origin
+    off = np.linalg.norm(offsets - (offsets @ grid.directions.T) @ grid.directions, axis=1)
+    near = marks.points[off < max(NEAR * grid.steps.max(), 0.1 * off.max())]
+    axes.scatter(*flat(near), s=0.8, color="white", alpha=0.7, linewidths=0)
+    if whole:
+        axes.plot([], [], ".", color="white", ms=3, label="object's points near the plane")
+        for points, style in _paths(landscape, marks)[:-1]:
+            axes.plot(*flat(points), **({"lw": 1.0, "ms": 3, "mec": INK, "mew": 0.4} | style))
+    axes.plot(*flat(landscape.minimisers[chosen]), **({"ms": 5, "mew": 1.3} | _MINIMISERS))
+
+
+_MINIMISERS = {"ls": "", "marker": "x", "color": TRUTH, "label": "waypoints' minimisers"}
+
+
+def _paths(landscape, marks, colour="white"):
+    """Points and matplotlib's style of each path, the demonstration's in a colour; the minimisers last."""
+    lines = [(landscape.waypoints, {"color": colour, "marker": "o", "mec": INK, "label": "demonstration, moved with the centroid"})]
+    if marks.expected is not None:
+        lines.append((marks.expected, {"color": "#e9c46a", "marker": "o", "mec": INK, "label": "true waypoints"}))
+    if marks.path is not None:
+        lines.append((marks.path, {"color": "#f4845f", "label": "lowest-cost path"}))
+    return [*lines, (landscape.minimisers, _MINIMISERS)]
+
+
+def _axis_name(direction):
+    """x, -y, ... of a world axis, and "along (...)" of another direction."""
+    axis = int(np.abs(direction).argmax())
+    if np.isclose(abs(direction[axis]), 1, atol=1e-6):
+        return ("-" if direction[axis] < 0 else "") + "xyz"[axis]
+    return "along (" + ", ".join(f"{part:.2f}" for part in direction) + ")"

@@ -1,0 +1,51 @@
+"""Curves of a training run, in matplotlib and without its global state."""
+
+from collections.abc import Sequence
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
+
+from tdf_jax.viz.style import INK, STYLE, TRUTH
+
+PANELS = (
+    ("bce", "occupancy: binary cross-entropy", "log"),
+    ("iou", "occupancy: IoU at 0.5; transfer: success", "linear"),
+    ("frame", "frame read out of the latent: squared error", "log"),
+    ("place", "places: -log share of the right pose", "linear"),
+)
+SMOOTH = 50  # steps averaged in the curves of training
+SETS = (("validation", "validation, complete clouds", TRUTH), ("one_view", "validation, one view", INK))
+
+
+def training_figure(rows: Sequence[dict]) -> Figure:
+    """Losses and IoU against the step, of training batches and of both validations.
+
+    Args:
+        rows: lines of metrics, as `tdf_jax.training.run_folder.metrics` reads them.
+    """
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(7.2, 4.6), layout="constrained")
+        axes = figure.subplots(2, 2, sharex=True)
+        steps = np.array([row["step"] for row in rows])
+        width = max(1, min(SMOOTH, len(rows) // 10))
+        for panel, (name, label, scale) in zip(axes.flat, PANELS):
+            values = np.convolve([row[name] for row in rows], np.ones(width) / width, mode="valid")
+            panel.plot(steps[width - 1 :], values, color="#9aa5b1", lw=1, label=f"training, mean of {width} steps")
+            for key, shown, colour in SETS:
+                measured = [(row["step"], row[key][name]) for row in rows if key in row]
+                panel.plot(*np.array(measured).reshape(-1, 2).T, color=colour, marker="o", ms=2.5, lw=1, label=shown)
+            panel.set(title=label, yscale=scale)
+            if scale == "log":
+                panel.yaxis.set_major_formatter("{x:g}")
+                # Within less than a decade the powers of ten alone would leave an axis without a number.
+                panel.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1, 0.5)))
+            panel.grid(color="#dddddd", lw=0.5)
+        shares = [(row["step"], row["transfer"]["success"]) for row in rows if "transfer" in row]
+        transfer = axes[0, 1].plot(*np.array(shares).reshape(-1, 2).T, color="#2a6f97", ls="--", marker="o", ms=2.5, lw=1)
+        axes[0, 0].legend(frameon=False)
+        axes[0, 1].legend(transfer, ["transfers within 2 cm and 20°"], frameon=False)
+        for panel in axes[1]:
+            panel.set_xlabel("step")
+    return figure

@@ -1,0 +1,299 @@
+"""The solver: its quadratic model, what passes from stage to stage, that it finds what `optimize` finds."""
+
+import dataclasses
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import carried, compilations, composed, random_cloud, random_poses
+from scipy.spatial.transform import Rotation
+
+import tdf_jax as tdf
+from tdf_jax.solvers import gauss_newton as descent
+from tdf_jax.geometry import se3 as poses
+from tdf_jax.energy.losses import pose_energy, waypoint_loss
+from tdf_jax._internal.errors import InputError
+from tdf_jax.solvers.adam import default_goal, random_starts
+from tdf_jax.solvers.multistart import Candidates, SolveConfig
+
+solve = sys.modules["tdf_jax.solvers.multistart"]  # `tdf_jax.solve` is the function
+
+CONFIG = SolveConfig(inits=3, scouts=8, points=3, steps=(2, 1, 3, 2, 2, 3), tolerance=0.0)
+LONG = (2, 1, 3, 2, 2, 30)
+WEIGHTS = tdf.EnergyWeights(correlation=0.3, lever=0.2)
+KEY = jax.random.key(0)
+
+
+def run(field, reference, key=KEY, config=CONFIG, energy=WEIGHTS, **settings):
+    return tdf.solve(field, reference, key, config=config, energy=energy, **settings)
+
+
+@pytest.fixture(scope="module")
+def result(field, reference):
+    return run(field, reference)
+
+
+def energy_of(trajectories, field, reference, weights=WEIGHTS):
+    return np.array([tdf.trajectory_energy(tdf.Trajectory(wxyz_xyz), field, reference, weights) for wxyz_xyz in trajectories])
+
+
+# ---- the quadratic model ----
+
+
+def moved(R, place, step):
+    return poses.exp(step[:3]) @ R, place + step[3:]
+
+
+@pytest.mark.parametrize("pose_norm", ["frobenius", "metres_radians", "mean_absolute"])
+def test_energies_and_gradients_are_those_of_the_energy(field, reference, pose_norm):
+    """All 8 query points, in blocks of 3: the last block is filled up with a point that must not count."""
+    weights = tdf.EnergyWeights(0.3, 0.0, 0.2, pose_norm)
+    problem = solve._problem(KEY, reference, 3)
+    assert problem.query.shape == (3, 3, 3) and problem.weights.sum() == 8
+    starts = random_starts(KEY, field, reference, 5, "scattered", 0.1)
+    drawn = solve._candidates(starts, problem)
+    R, place = drawn.R.reshape(-1, 3, 3), drawn.place.reshape(-1, 3)
+    waypoint = np.tile(np.arange(4), 5)
+    values = descent._evaluate(R, place, waypoint, np.array([20, 20, 3, 0]), field, problem, weights, 128)
+
+    def energy(step, R, place, index):
+        R, place = moved(R, place, step)
+        t = place - R @ problem.centre
+        one = jax.tree.map(lambda part: part[index][None], reference.trajectory)
+        prior = pose_energy(R[None], t[None], field.origin, dataclasses.replace(reference, trajectory=one), weights)
+        return waypoint_loss(R, t, field, reference.query, reference.descriptors[index]) + prior
+
+    expected, gradient = jax.vmap(jax.value_and_grad(energy), (None, 0, 0, 0))(jnp.zeros(6), R, place, waypoint)
+    np.testing.assert_allclose(values[0], expected, rtol=1e-5)
+    np.testing.assert_allclose(values[1], gradient, atol=1e-4 * np.abs(gradient).max())
+
+
+def test_the_curvature_is_that_of_reweighted_squares(field, reference):
+    problem = solve._problem(KEY, reference, 8)
+    R, place = (jnp.asarray(part[0, :1]) for part in solve._candidates(random_starts(KEY, field, reference, 1, "scattered", 0.1), problem)[:2])
+    shown = problem.descriptors[:1, 0]
+
+    def residual(step):
+        turned, centre = moved(R[0], place[0], step)
+        return field.descriptors(problem.query[0] @ turned.T + centre) - shown[0]
+
+    value, jacobian = (np.asarray(part, np.float64) for part in (residual(jnp.zeros(6)), jax.jacfwd(residual)(jnp.zeros(6))))
+    size = np.abs(value)
+    weights = 1 / np.maximum(size, size.mean(axis=-1, keepdims=True)) / value.size
+    expected = np.einsum("qca,qc,qcb->ab", jacobian, weights, jacobian)
+    _, _, hessian = descent._match(R, place, field, problem.query[0], problem.weights[0] / 8, shown)
+    np.testing.assert_allclose(hessian[0], expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_a_step_solves_the_damped_system_and_is_bounded():
+    rng = np.random.default_rng(0)
+    half = rng.normal(size=(4, 6, 6))
+    hessian, gradient = half @ half.swapaxes(1, 2) + np.eye(6), 1e-3 * rng.normal(size=(4, 6))
+    state = descent._State(jnp.zeros((4, 3, 3)), jnp.zeros((4, 3)), jnp.ones(4), jnp.float32(gradient), jnp.float32(hessian))
+    damping = jnp.array([0.1, 1.0, 0.0, 10.0])
+    step, promise = descent._step(state, damping)
+    damped = hessian + np.asarray(damping)[:, None, None] * hessian * np.eye(6)
+    expected = -np.linalg.solve(damped, gradient[..., None])[..., 0]
+    np.testing.assert_allclose(step, expected, rtol=1e-3, atol=1e-7)
+    fall = -(gradient * expected).sum(axis=1) - np.einsum("ca,cab,cb->c", expected, hessian, expected) / 2
+    np.testing.assert_allclose(promise, fall, rtol=1e-3)
+    long, _ = descent._step(state._replace(gradient=1e4 * state.gradient), damping)
+    assert np.linalg.norm(long[:, :3], axis=1).max() <= descent.LARGEST_TURN * (1 + 1e-6)
+    assert np.linalg.norm(long[:, 3:], axis=1).max() <= descent.LARGEST_MOVE * (1 + 1e-6)
+    cosine = (long * expected).sum(axis=1) / np.linalg.norm(long, axis=1) / np.linalg.norm(expected, axis=1)
+    np.testing.assert_allclose(cosine, 1, atol=1e-4)
+
+
+def test_chunks_do_not_show(field, reference):
+    problem = solve._problem(KEY, reference, 3)
+    drawn = solve._candidates(random_starts(KEY, field, reference, 2, "carried", 0.1), problem)
+    settings = (drawn.R.reshape(-1, 3, 3), drawn.place.reshape(-1, 3), np.tile(np.arange(4), 2), np.array([8, 8, 3, 0]), field, problem, WEIGHTS)
+    # 3 poses at a time: the last chunk overlaps the one before.
+    for part, expected in zip(descent._evaluate(*settings, 9), descent._evaluate(*settings, 128), strict=True):
+        np.testing.assert_allclose(part, expected, rtol=1e-4, atol=1e-6)
+
+
+# ---- from stage to stage ----
+
+
+def test_carried_candidates_are_rigid_motions_of_the_demonstration(field, reference):
+    problem = solve._problem(KEY, reference, 8)
+    starts = random_starts(KEY, field, reference, 4, "scattered", 0.1)
+    drawn = solve._candidates(starts, problem)
+    energy = np.random.default_rng(0).uniform(size=(4, 3))
+    found = Candidates(drawn.R[:, :3], drawn.place[:, :3], energy)
+    picked = Candidates(drawn.R[2:, 1:2], drawn.place[2:, 1:2])
+    shown_candidates = solve._candidates(reference.trajectory.wxyz_xyz, problem)
+    new = np.array(solve._poses(solve._carried(found, picked, 1, shown_candidates, field.origin), problem), np.float64)
+    assert new.shape == (6, 3, 7)
+    shown = np.array(reference.trajectory.shifted(field.origin).wxyz_xyz[:3], np.float64)
+    for index, (row, waypoint) in enumerate([*((row, waypoint) for waypoint, row in enumerate(energy.argmin(axis=0))), (2, 1), (3, 1)]):
+        best = np.array(starts[row, waypoint], np.float64)
+        turn = Rotation.from_quat(best[:4], scalar_first=True) * Rotation.from_quat(shown[waypoint, :4], scalar_first=True).inv()
+        motion = np.concatenate([turn.as_quat(scalar_first=True), best[4:] - turn.apply(shown[waypoint, 4:])])
+        expected = composed(motion, shown)
+        expected *= np.where(np.arange(7) < 4, np.sign((expected[:, :4] * new[index, :, :4]).sum(axis=1))[:, None], 1)
+        np.testing.assert_allclose(new[index], expected, atol=2e-6)
+    np.testing.assert_allclose(np.abs(new[5]), np.abs(shown), atol=2e-6)
+
+
+def test_distinct_candidates_are_the_best_of_each_waypoint():
+    turns = Rotation.from_rotvec([[0, 0, 0], [0.05, 0, 0], [0.5, 0, 0], [0, 0, 0]]).as_matrix()
+    R = np.stack([turns, turns], axis=1)
+    place = np.zeros((4, 2, 3))
+    place[3, :, 0] = 0.05
+    energy = np.array([[0.2, 0.4], [0.1, 0.3], [0.4, 0.2], [0.3, 0.1]])
+    best = solve._distinct(Candidates(R, place, energy), 3)
+    # Candidates 0 and 1 are 3 degrees apart and count as one.
+    for waypoint, expected in enumerate([[1, 3, 2], [3, 2, 1]]):
+        np.testing.assert_array_equal(best.R[:, waypoint], turns[expected])
+        np.testing.assert_array_equal(best.place[:, waypoint], place[expected, waypoint])
+    most = solve._distinct(Candidates(R, place, energy), 4)
+    np.testing.assert_array_equal(most.R[3, 0], turns[0])  # none distinct is left
+
+
+# ---- the result ----
+
+
+def test_energies_are_those_of_the_trajectories_and_the_first_is_the_best(result, field, reference):
+    assert result.trajectories.shape == (2, 4, 7) and result.losses.shape == (2, 10)
+    np.testing.assert_allclose(result.energies, energy_of(result.trajectories, field, reference), rtol=1e-5)
+    np.testing.assert_allclose(result.losses[:, -3], energy_of(result.starts, field, reference), rtol=1e-5)
+    assert result.best == 0 and result.energies[0] <= result.energies[1]
+    for stage in (slice(0, 3), slice(3, 5), slice(5, 7), slice(7, 10)):  # energies of one set of query points do not rise
+        assert (np.diff(result.losses[:, stage], axis=1) <= 1e-7).all()
+    assert (result.energies <= result.losses[:, -1] + 1e-7).all()
+
+
+def test_the_last_pose_is_fixed_at_the_goal_exactly(field, reference, result):
+    np.testing.assert_array_equal(result.trajectories[:, -1], np.tile(default_goal(field, reference), (2, 1)))
+    goal = jnp.asarray(random_poses(9, 1)[0], jnp.float32)
+    np.testing.assert_array_equal(run(field, reference, goal=goal).trajectories[:, -1], np.tile(goal, (2, 1)))
+
+
+def test_a_free_last_pose_moves_and_energies_are_of_all_poses(field, reference):
+    weights = tdf.EnergyWeights(0.0)  # at the goal, eq. 3 alone is least
+    free, fixed = (run(field, reference, config=SolveConfig(points=8), energy=weights, fix_last=fix_last) for fix_last in (False, True))
+    np.testing.assert_allclose(free.energies, energy_of(free.trajectories, field, reference, weights), rtol=1e-5)
+    assert np.abs(free.trajectories[0, -1] - fixed.trajectories[0, -1]).max() > 1e-3
+    assert free.loss < fixed.loss
+
+
+def test_it_reaches_what_adam_reaches(field, reference):
+    """On random networks minima are many: 20 starts each, of both kinds."""
+    for start in ("carried", "scattered"):
+        starts = random_starts(KEY, field, reference, 20, start, 0.1)
+        adam = tdf.optimize(field, reference, KEY, energy=WEIGHTS, config=tdf.OptimizeConfig(20, 100), starts=starts, goal=default_goal(field, reference))
+        found = run(field, reference, starts=starts, goal=default_goal(field, reference), config=SolveConfig(points=8, steps=(30,) * 6, tolerance=0.0))
+        assert found.loss < 1.02 * adam.loss
+
+
+def test_a_known_pose_is_found_on_the_same_object(golden, quick_compilation):
+    """The demonstrated grasp on the moved object, from random starts, to 1 degree and 1 mm."""
+    points = golden.arrays["point_cloud"][0] + (0.3, -0.2, 0.1)
+    demonstrated = random_poses(1, 2, 0.05) + [0, 0, 0, 0, 0.3, -0.2, 0.1]
+    query = tdf.box_query(jax.random.key(0), count=64, size=0.08, centre=(0.05, 0.02, 0.0))
+    trajectory = tdf.Trajectory(jnp.asarray(demonstrated, jnp.float32))
+    reference = tdf.describe(golden.model, tdf.Demonstration(points.astype(np.float32), trajectory, query))
+    motion = random_poses(5, 1, 0.3)[0]
+    truth = composed(motion, demonstrated)
+    field = tdf.encode(golden.model, carried(motion, points).astype(np.float32))
+    result = tdf.solve(
+        field, reference, KEY, goal=jnp.asarray(truth[-1], jnp.float32), energy=tdf.EnergyWeights(correlation=0.0), config=SolveConfig()
+    )
+    pick = np.array(result.trajectory.wxyz_xyz[0], np.float64)
+    turn = Rotation.from_quat(pick[:4], scalar_first=True) * Rotation.from_quat(truth[0, :4], scalar_first=True).inv()
+    assert np.degrees(turn.magnitude()) < 1
+    assert np.linalg.norm(pick[4:] - truth[0, 4:]) < 1e-3
+
+
+def test_results_are_a_function_of_the_key(field, reference, result):
+    again, other = run(field, reference), run(field, reference, key=jax.random.key(1))
+    for name in ("trajectories", "losses", "energies", "starts"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(result, name))
+    assert np.abs(other.trajectories - result.trajectories)[:, :-1].max() > 1e-3
+
+
+def test_a_stage_ends_when_no_step_promises_enough(field, reference):
+    result = run(field, reference, config=dataclasses.replace(CONFIG, steps=LONG, tolerance=0.5))
+    np.testing.assert_array_equal(result.losses[:, -29:], np.tile(result.losses[:, -1:], 29))
+    thorough = run(field, reference, config=dataclasses.replace(CONFIG, steps=LONG))
+    assert thorough.loss < result.loss
+    np.testing.assert_array_equal(result.trajectories, result.starts)
+
+
+def test_a_start_that_is_not_finite_does_not_spoil_the_others(field, reference):
+    starts = random_starts(KEY, field, reference, 3, "carried", 0.1).at[:, -1].set(default_goal(field, reference))
+    with jax.debug_nans(False):
+        far = run(field, reference, starts=starts.at[1, 0, 4].set(1e30))
+    assert far.finite.all() and far.loss <= run(field, reference, starts=starts[jnp.array([0, 2])]).loss * 1.2
+
+
+def test_progress_follows_the_stages_and_can_cancel(field, reference, result):
+    calls = []
+    run(field, reference, progress=lambda done, energies: calls.append((done, energies)))
+    assert [done for done, _ in calls] == [2, 3, 6, 8, 10, 13] and all(len(energies) == 2 for _, energies in calls)
+
+    def cancel(done, energies):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(field, reference, progress=cancel)
+
+
+def test_stages_and_what_is_traced_share_one_program(small_model, field, reference, result):
+    with compilations() as compiled:
+        other = tdf.encode(small_model, jnp.asarray(random_cloud(30), jnp.float32))
+        for weight in (0, 0.5, jnp.array(0.1)):
+            run(other, reference, key=jax.random.key(5), energy=tdf.EnergyWeights(correlation=weight, lever=weight))
+        run(field, reference, config=dataclasses.replace(CONFIG, tolerance=0.1))
+    assert not {"jit(descend)", "jit(in_blocks)", "jit(_random_starts)"} & set(compiled)
+
+
+# ---- bad input ----
+
+
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [
+        ({"inits": 0}, "inits"),
+        ({"points": 2.5}, "points"),
+        ({"scouts": True}, "scouts"),
+        ({"steps": (1, 2, 3)}, "steps"),
+        ({"steps": 5}, "steps"),
+        ({"steps": (1, 1, 1, 1, 1, 0)}, "steps"),
+        ({"finalists": 0}, "finalists"),
+        ({"chunk": 0}, "chunk"),
+        ({"tolerance": -0.1}, "tolerance"),
+        ({"tolerance": np.nan}, "tolerance"),
+        ({"start_radius": np.inf}, "start_radius"),
+        ({"start": "middle"}, "expected one of carried, scattered"),
+    ],
+)
+def test_bad_settings_are_refused(settings, name):
+    with pytest.raises(InputError, match=rf"SolveConfig\(\).*{name}"):
+        SolveConfig(**settings)
+
+
+def test_what_couples_waypoints_is_refused(field, reference):
+    with pytest.raises(InputError, match=r"solve\(\): energy.compensator is 0.1; expected 0.*Use optimize"):
+        run(field, reference, energy=tdf.EnergyWeights(0.02, 0.1))
+    starts = jnp.asarray(np.stack([random_poses(seed, 4) for seed in range(3)]), jnp.float32)
+    with pytest.raises(InputError, match="the last poses of the starts differ"):
+        run(field, reference, starts=starts)
+    one = dataclasses.replace(reference, descriptors=reference.descriptors[:1], trajectory=tdf.Trajectory(reference.trajectory.wxyz_xyz[:1]))
+    with pytest.raises(InputError, match="expected fix_last=False"):
+        run(field, one)
+    with pytest.raises(InputError, match=r"solve\(\): key is 0"):
+        run(field, reference, key=0, starts=starts)
+    with pytest.raises(InputError, match=r"solve\(\): starts have shape"):
+        run(field, reference, starts=starts[0])
+
+
+def test_one_pose_alone_is_found(field, reference):
+    one = dataclasses.replace(reference, descriptors=reference.descriptors[:1], trajectory=tdf.Trajectory(reference.trajectory.wxyz_xyz[:1]))
+    result = run(field, one, fix_last=False)
+    assert result.trajectories.shape == (2, 1, 7)
+    np.testing.assert_allclose(result.energies, energy_of(result.trajectories, field, one), rtol=1e-5)
