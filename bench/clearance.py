@@ -7,9 +7,10 @@ import jax
 import numpy as np
 
 import tdf_jax as tdf
-from tdf_jax.planning.avoidance import clearance, push_clear
-from tdf_jax.planning.obstacles import box_obstacle
+from tdf_jax.geometry.distance_fields import box_obstacle
 from tdf_jax.geometry.paths import SHAPES
+from tdf_jax.planning.avoidance import push_clear
+from tdf_jax.planning.distances import clearance
 
 
 def scene(seed: int, body):

@@ -15,12 +15,12 @@ import numpy as np
 
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.files import replace_file
 from tdf_jax.evaluation.cases import mug_case
+from tdf_jax.geometry.paths import SHAPES
 from tdf_jax.paper import setting as settings
 from tdf_jax.paper.table import PAPER
-from tdf_jax._internal.files import replace_file
-from tdf_jax.solvers.adam import default_goal
-from tdf_jax.geometry.paths import SHAPES
+from tdf_jax.solvers.initial import default_goal
 
 QUERIES, QUERY_SIZE = 128, 0.06
 PLACE = np.array([0.0, 0.3, 0.1])  # of the goal from the handle, metres

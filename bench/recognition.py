@@ -13,12 +13,11 @@ import jax
 import numpy as np
 
 import tdf_jax as tdf
-from tdf_jax.uncertainty.reliability import logistic, ranking
 from tdf_jax.evaluation.cases import generated_case
-from tdf_jax.evaluation.scene import place_demonstration
 from tdf_jax.evaluation.pick_transfer import QUERIES, QUERY_SIZE
-from tdf_jax.uncertainty.category import CURVES
+from tdf_jax.evaluation.scene import place_demonstration
 from tdf_jax.shapes import FAMILIES
+from tdf_jax.uncertainty.calibration import CURVES, logistic, ranking
 
 CLOUDS = ("full", "views1", "views2", "noise")
 THRESHOLDS = (0.05, 0.25, 0.5, 0.75, 0.95)

@@ -9,7 +9,7 @@ from tdf_jax.energy.losses import compensator_loss as compensator_loss
 from tdf_jax.energy.losses import correlation_loss as correlation_loss
 from tdf_jax.energy.losses import descriptor_loss as descriptor_loss
 from tdf_jax.energy.losses import trajectory_energy as trajectory_energy
-from tdf_jax.energy.reference import Demonstration as Demonstration
+from tdf_jax.geometry.demonstration import Demonstration as Demonstration
 from tdf_jax.energy.reference import Reference as Reference
 from tdf_jax.energy.reference import describe as describe
 from tdf_jax.geometry.grid import Grid as Grid
@@ -31,15 +31,15 @@ from tdf_jax.geometry.se3 import rotation_grid as rotation_grid
 from tdf_jax.geometry.se3 import turns as turns
 from tdf_jax.geometry.trajectory import Trajectory as Trajectory
 from tdf_jax.geometry.trajectory import displace as displace
-from tdf_jax.geometry.trajectory import load_trajectory as load_trajectory
+from tdf_jax.io.trajectories import load_trajectory as load_trajectory
 from tdf_jax.geometry.trajectory import resample as resample
-from tdf_jax.geometry.trajectory import save_trajectory as save_trajectory
+from tdf_jax.io.trajectories import save_trajectory as save_trajectory
 from tdf_jax.imitation import imitate as imitate
 from tdf_jax.imitation import imitate_batch as imitate_batch
 from tdf_jax.io.meshes import load_mesh as load_mesh
-from tdf_jax.io.meshes import sample_surface as sample_surface
+from tdf_jax.geometry.sampling import sample_surface as sample_surface
 from tdf_jax.io.pointclouds import load_points as load_points
-from tdf_jax.io.pointclouds import thin as thin
+from tdf_jax.geometry.sampling import thin as thin
 from tdf_jax.landscape.energy_grid import energy_landscape as energy_landscape
 from tdf_jax.landscape.shortest_path import lowest_cost_path as lowest_cost_path
 from tdf_jax.landscape.storage import Landscape as Landscape
@@ -51,17 +51,17 @@ from tdf_jax.networks.checkpoint import save_model as save_model
 from tdf_jax.networks.field import DescriptorField as DescriptorField
 from tdf_jax.networks.model import Model as Model
 from tdf_jax.networks.model import ModelInfo as ModelInfo
-from tdf_jax.networks.model import encode as encode
+from tdf_jax.networks.encoding import encode as encode
 from tdf_jax.networks.ndf_checkpoint import convert_checkpoint as convert_checkpoint
 from tdf_jax.networks.occupancy import NetworkConfig as NetworkConfig
 from tdf_jax.networks.refinement import refine as refine
 from tdf_jax.planning.avoidance import ClearanceConfig as ClearanceConfig
-from tdf_jax.planning.avoidance import clearance as clearance
+from tdf_jax.planning.distances import clearance as clearance
 from tdf_jax.planning.avoidance import push_clear as push_clear
-from tdf_jax.planning.obstacles import box_obstacle as box_obstacle
-from tdf_jax.planning.obstacles import cloud_obstacle as cloud_obstacle
-from tdf_jax.planning.obstacles import field_obstacle as field_obstacle
-from tdf_jax.planning.obstacles import mesh_obstacle as mesh_obstacle
+from tdf_jax.geometry.distance_fields import box_obstacle as box_obstacle
+from tdf_jax.geometry.distance_fields import cloud_obstacle as cloud_obstacle
+from tdf_jax.planning.occupied import field_obstacle as field_obstacle
+from tdf_jax.geometry.distance_fields import mesh_obstacle as mesh_obstacle
 from tdf_jax.shapes import BottleParameters as BottleParameters
 from tdf_jax.shapes import BowlParameters as BowlParameters
 from tdf_jax.shapes import MugParameters as MugParameters
@@ -72,18 +72,18 @@ from tdf_jax.shapes import sample_bottle as sample_bottle
 from tdf_jax.shapes import sample_bowl as sample_bowl
 from tdf_jax.shapes import sample_mug as sample_mug
 from tdf_jax.solvers.adam import OptimizeConfig as OptimizeConfig
-from tdf_jax.solvers.adam import Result as Result
+from tdf_jax.solvers.result import Result as Result
 from tdf_jax.solvers.adam import optimize as optimize
 from tdf_jax.solvers.multistart import SolveConfig as SolveConfig
 from tdf_jax.solvers.multistart import solve as solve
 from tdf_jax.solvers.pick import CarryConfig as CarryConfig
 from tdf_jax.solvers.pick import carry as carry
-from tdf_jax.solvers.pick import carry_trajectory as carry_trajectory
+from tdf_jax.geometry.transport import carry_trajectory as carry_trajectory
 from tdf_jax.uncertainty.calibration import confidence as confidence
-from tdf_jax.uncertainty.category import recognition as recognition
-from tdf_jax.uncertainty.category import surface_logit as surface_logit
+from tdf_jax.uncertainty.calibration import recognition as recognition
+from tdf_jax.uncertainty.calibration import surface_logit as surface_logit
 from tdf_jax.uncertainty.modes import cluster_poses as cluster_poses
-from tdf_jax.uncertainty.modes import pose_covariance as pose_covariance
+from tdf_jax.uncertainty.covariance import pose_covariance as pose_covariance
 
 __version__ = "0.1.0"
 

@@ -8,16 +8,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from tdf_jax.solvers.pick import CarryConfig, carry
-from tdf_jax.uncertainty.calibration import CALIBRATED
-from tdf_jax.energy.reference import Demonstration, Reference, describe
-from tdf_jax.energy.losses import EnergyWeights
-from tdf_jax._internal.errors import CategoryWarning, InputError
 from tdf_jax._internal.checks import check_key
-from tdf_jax.networks.model import Model, encode
-from tdf_jax.solvers.adam import OptimizeConfig, Result, default_goal, optimize
-from tdf_jax.uncertainty.category import CURVES, recognition, surface_logit
+from tdf_jax._internal.errors import CategoryWarning, InputError
+from tdf_jax.energy.losses import EnergyWeights
+from tdf_jax.energy.reference import Reference, describe
+from tdf_jax.geometry.demonstration import Demonstration
+from tdf_jax.networks.encoding import encode
+from tdf_jax.networks.model import Model
+from tdf_jax.solvers.adam import OptimizeConfig, optimize
+from tdf_jax.solvers.initial import default_goal
 from tdf_jax.solvers.multistart import SolveConfig, solve
+from tdf_jax.solvers.pick import CarryConfig, carry
+from tdf_jax.solvers.result import Result
+from tdf_jax.uncertainty.calibration import CALIBRATED, CURVES, recognition, surface_logit, confidence
 
 DOUBT = 0.5  # probability of the demonstration's category below which a warning is issued
 
@@ -92,7 +95,7 @@ def _judged(result: Result, weights: str, field, points) -> Result:
             CategoryWarning,
             stacklevel=3,
         )
-    return dataclasses.replace(result, recognised=recognised, confidence=result.confidence if weights in CALIBRATED else None)
+    return dataclasses.replace(result, recognised=recognised, confidence=confidence(result.residual) if weights in CALIBRATED else None)
 
 
 def imitate_batch(

@@ -9,7 +9,7 @@ from conftest import compilations, random_cloud, random_poses
 
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
-from tdf_jax.io.pointclouds import thin
+from tdf_jax.geometry.sampling import thin
 
 CONFIG = tdf.OptimizeConfig(inits=3, iterations=5)
 KEY = jax.random.key(0)

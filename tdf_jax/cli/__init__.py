@@ -1,1 +1,5 @@
-"""The command line, `tdf`: one file per command."""
+"""The command line, `tdf`: one file a command, named as the command.
+
+    main     the commands, and errors as messages
+    options  options that commands share
+"""

@@ -43,16 +43,16 @@ def benchmark(
         demonstrations: also measure picks learnt from so many demonstrations, such as 1 3 5 10.
         out: folder for the page; what was computed is kept in its folder runs.
     """
+    from tdf_jax._internal.errors import InputError
+    from tdf_jax._internal.files import replace_file
+    from tdf_jax.evaluation.annotated_meshes import load_annotated
+    from tdf_jax.evaluation.demonstration_count import learnt
     from tdf_jax.evaluation.methods import METHODS
     from tdf_jax.evaluation.path_page import page, record, sections
-    from tdf_jax.evaluation.demonstration_count import learnt
     from tdf_jax.evaluation.path_runs import run
     from tdf_jax.evaluation.path_scores import score
+    from tdf_jax.geometry.winding import libigl
     from tdf_jax.networks.checkpoint import load_model
-    from tdf_jax._internal.errors import InputError
-    from tdf_jax.evaluation.annotated_meshes import load_annotated
-    from tdf_jax._internal.files import replace_file
-    from tdf_jax.io.meshes import libigl
 
     _check(pairs, seed, height, clouds, methods, inits, meshes, poses, demonstrations)
     names = list(METHODS) if "all" in methods else [name for name in METHODS if name in methods]
@@ -81,8 +81,8 @@ def benchmark(
 
 
 def _makers(pairs, seed, height, clouds, targets, poses) -> list[Callable]:
-    from tdf_jax.evaluation.path_tasks import make_task, mesh_index
     from tdf_jax.evaluation.cases import mesh_case, mug_case
+    from tdf_jax.evaluation.path_tasks import make_task, mesh_index
 
     def generated(index):
         return make_task(mug_case(seed, index, height=height, clouds=clouds), seed, index)
@@ -127,9 +127,9 @@ def _folder(out: Path) -> Path:
 
 
 def _check(pairs, seed, height, clouds, methods, inits, meshes, poses, demonstrations) -> None:
+    from tdf_jax._internal.errors import InputError
     from tdf_jax.evaluation.demonstration_count import MOST
     from tdf_jax.evaluation.methods import METHODS
-    from tdf_jax._internal.errors import InputError
 
     def need(truth, what):
         if not truth:

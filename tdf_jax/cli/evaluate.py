@@ -1,10 +1,20 @@
 """`tdf evaluate`: how well weights transfer a pose to unseen generated objects and to real meshes, beside baselines."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from tdf_jax._internal.errors import InputError
+
+if TYPE_CHECKING:
+    from tdf_jax.evaluation.comparison import Outcome
+    from tdf_jax.evaluation.report import Outcomes
+    from tdf_jax.networks.model import Model
+    from tdf_jax.viz.reconstruction import Panel
+
+NAMES = ("reconstructions.png", "transfers.png")
+MOST_GENERATED = 6
 _NONE = "(default: none)"
 Category = Literal["mug", "bowl", "bottle"]
 Cloud = Literal["full", "views1", "views2", "views4", "points300", "points1000", "points3000", "noise", "half", "double", "all"]
@@ -50,16 +60,14 @@ def evaluate(
     import functools
     import sys
 
-    from tdf_jax.networks.checkpoint import load_model
-    from tdf_jax.evaluation import model_card as cards
-    from tdf_jax.evaluation import report as scores
     from tdf_jax.cli.options import categories_of
-    from tdf_jax._internal.errors import InputError
+    from tdf_jax.evaluation import model_card as cards, report as scores
     from tdf_jax.evaluation.annotated_meshes import load_annotated
     from tdf_jax.evaluation.cases import generated_case, mesh_case
-    from tdf_jax.evaluation.conditions import CONDITIONS
     from tdf_jax.evaluation.comparison import BASELINES, compare
-    from tdf_jax.io.meshes import libigl
+    from tdf_jax.evaluation.conditions import CONDITIONS
+    from tdf_jax.geometry.winding import libigl
+    from tdf_jax.networks.checkpoint import load_model
     from tdf_jax.solvers.adam import OptimizeConfig
 
     _check_numbers(pairs, seed, size, clouds, meshes, poses)
@@ -96,13 +104,10 @@ def evaluate(
     if card is not None:
         cards.write(card, cards.card(model, outcomes, settings))
     if figures is not None:
-        from tdf_jax.cli.pictures import draw
-
-        draw(figures, model, outcomes)
+        _draw(figures, model, outcomes)
 
 
 def _check_numbers(pairs, seed, size, clouds, meshes, poses) -> None:
-    from tdf_jax._internal.errors import InputError
 
     if pairs < 1 and (meshes is None or pairs < 0):
         raise InputError(f"tdf evaluate: --pairs is {pairs}; expected at least 1, or 0 with --meshes")
@@ -117,7 +122,6 @@ def _check_numbers(pairs, seed, size, clouds, meshes, poses) -> None:
 
 
 def _check_place(place: str | None, categories: tuple[str, ...]) -> None:
-    from tdf_jax._internal.errors import InputError
     from tdf_jax.shapes import FAMILIES
 
     for category in categories:
@@ -127,10 +131,70 @@ def _check_place(place: str | None, categories: tuple[str, ...]) -> None:
 
 def _check_outputs(json: Path | None, card: Path | None, figures: Path | None) -> None:
     """Refuse now what could not be written in an hour."""
-    from tdf_jax._internal.errors import InputError
 
     for name, path in (("json", json), ("card", card)):
         if path is not None and (path.is_dir() or not path.parent.is_dir()):
             raise InputError(f"tdf evaluate: --{name} is {path}; expected a file in an existing folder")
     if figures is not None and not (figures.is_dir() or (figures.parent.is_dir() and not figures.exists())):
         raise InputError(f"tdf evaluate: --figures is {figures}; expected a folder, or a new name in an existing one")
+
+
+def _draw(folder: Path, model: "Model", outcomes: "Outcomes") -> None:
+    """Draw the first condition: up to `MOST_GENERATED` generated objects of a category, and every real one in its first pose.
+
+    Args:
+        folder: made if it is missing; pictures in it are replaced.
+        model: whose outcomes are the first of each list.
+        outcomes: of every method; baselines are not drawn.
+
+    Raises:
+        InputError: the folder or a picture cannot be written.
+    """
+    from tdf_jax.evaluation.report import is_real
+    from tdf_jax.viz.reconstruction import reconstruction_figure, transfer_figure
+    from tdf_jax.viz.style import save_figure
+
+    _, condition = next(iter(outcomes))
+    panels = []
+    for (objects, clouds), (outcome, *_) in outcomes.items():
+        if clouds == condition:
+            names = [case.instance for case in outcome.cases]
+            firsts = [names.index(name) for name in dict.fromkeys(names)]
+            panels += [_panel(model, outcome, index) for index in firsts[: None if is_real(objects) else MOST_GENERATED]]
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(f"tdf evaluate: cannot make {folder} ({error}); expected a place in an existing folder") from None
+    words = f"weights {model.info.name}, cloud {condition}"
+    figures = (
+        reconstruction_figure(panels, f"Surfaces of occupancy 0.5, refined: {words}"),
+        transfer_figure(panels, f"The place of a demonstration on other objects: {words}"),
+    )
+    for name, figure in zip(NAMES, figures):
+        save_figure(folder / name, figure)
+
+
+def _panel(model: "Model", outcome: "Outcome", index: int) -> "Panel":
+    import numpy as np
+
+    from tdf_jax.evaluation.pick_transfer import QUERY_SIZE
+    from tdf_jax.geometry import se3
+    from tdf_jax.networks.encoding import encode
+    from tdf_jax.networks.refinement import refine
+    from tdf_jax.networks.surface import reconstructed
+    from tdf_jax.viz.reconstruction import Panel
+
+    case, iou = outcome.cases[index], outcome.ious["iou_refined"][index]
+    T_world_b = case.T_world_b
+    T_world_found = np.eye(4)
+    T_world_found[:3, :3], T_world_found[:3, 3] = se3.rotation(outcome.found[index]), outcome.found[index][4:]
+    return Panel(
+        name=case.instance,
+        overlap="IoU n/a: not closed" if iou is None else f"IoU {iou:.2f}",
+        error=f"{100 * outcome.distance[index]:.1f} cm, {outcome.angle[index]:.0f}° off",
+        triangles=np.asarray(case.object_b.mesh.triangles),
+        found=reconstructed(refine(model, encode(model, case.points_b), case.points_b), T_world_b, case.object_b.mesh.bounds),
+        T_object_true=np.linalg.inv(T_world_b) @ case.T_world_place_b,
+        T_object_found=np.linalg.inv(T_world_b) @ T_world_found,
+        size=QUERY_SIZE * case.scale,
+    )

@@ -1,6 +1,7 @@
 """`tdf imitate`: the main job, from files or a pair of generated mugs to a folder of results."""
 
 import contextlib
+import dataclasses
 import json
 import sys
 import time
@@ -14,24 +15,31 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from tdf_jax.solvers.pick import CarryConfig
-from tdf_jax.networks.checkpoint import load_model
-from tdf_jax.cli import report
-from tdf_jax.cli.scene import make_scene
-from tdf_jax.cli.options import Settings, resolved
-from tdf_jax.energy.reference import describe
-from tdf_jax.energy.losses import EnergyWeights
+import tdf_jax
 from tdf_jax._internal.errors import CategoryWarning, InputError
-from tdf_jax.evaluation.scene import Scene
 from tdf_jax._internal.files import replace_file, replace_folder
+from tdf_jax.cli.options import Settings, make_scene, resolved
+from tdf_jax.energy.losses import EnergyWeights
+from tdf_jax.energy.reference import describe
+from tdf_jax.evaluation.metrics import path_error, pose_error
+from tdf_jax.evaluation.scene import Scene
+from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.imitation import imitate as imitate_scene
-from tdf_jax.solvers.adam import OptimizeConfig, Result
+from tdf_jax.io.trajectories import save_trajectory
+from tdf_jax.networks.checkpoint import load_model
+from tdf_jax.networks.model import Model
+from tdf_jax.solvers.adam import OptimizeConfig
 from tdf_jax.solvers.multistart import SolveConfig
-from tdf_jax.geometry.trajectory import save_trajectory
+from tdf_jax.solvers.pick import CarryConfig
+from tdf_jax.solvers.result import Result
+from tdf_jax.uncertainty.modes import cluster_poses
 
 # Folded into the seed's key: `random_pose` draws a generated mug's rotation from the key of the same seed, and a start
 # drawn from that one would be the answer.
 STREAM = 0x1D317A7E
+SCHEMA = 2  # raised when a field of result.json changes its meaning or goes
+RESULT = "result.json"
+NAMES = (RESULT, "trajectory.npz", "trajectory.tum", "imitation.png", "loss.png")
 
 
 def imitate(settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()) -> None:
@@ -40,9 +48,9 @@ def imitate(settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()) 
     Writes a folder with result.json, trajectory.npz, trajectory.tum, imitation.png and loss.png.
     """
     settings = resolved(settings)
-    with replace_folder("tdf imitate", settings.out, report.RESULT, report.NAMES) as folder:
+    with replace_folder("tdf imitate", settings.out, RESULT, NAMES) as folder:
         record = _run(settings, folder)
-    print(json.dumps(record, indent=1) if settings.json else report.table(record, settings.out))
+    print(json.dumps(record, indent=1) if settings.json else _table(record, settings.out))
 
 
 def _run(settings: Settings, folder: Path) -> dict:
@@ -81,8 +89,8 @@ def _run(settings: Settings, folder: Path) -> dict:
     for doubt in doubts:
         print(f"tdf: warning: {doubt.message}", file=sys.stderr)
     seconds["total"] = time.perf_counter() - began
-    record = report.record(settings, model, scene, energy, config, result, seconds)
-    replace_file("tdf imitate", folder / report.RESULT, json.dumps(record, indent=1).encode())
+    record = _record(settings, model, scene, energy, config, result, seconds)
+    replace_file("tdf imitate", folder / RESULT, json.dumps(record, indent=1).encode())
     return record
 
 
@@ -109,7 +117,7 @@ def _draw(folder: Path, scene: Scene, result: Result, rows: str) -> None:
 
     trajectory = result.trajectory
     expected = scene.expected(trajectory.wxyz_xyz[-1], trajectory.wxyz_xyz[0])
-    title = report.title(result.loss, report.errors(trajectory, expected))
+    title = _title(result.loss, _errors(trajectory, expected))
     figure = imitation_figure(scene.demonstration, scene.points, trajectory, expected, scene.meshes, title)
     save_figure(folder / "imitation.png", figure)
     history = np.column_stack([result.losses, result.energies])
@@ -133,3 +141,126 @@ def _progress(iterations: int) -> Iterator:
             bar.update(done - bar.n)
 
         yield move
+
+
+def _errors(trajectory: Trajectory, expected: Trajectory | None) -> dict | None:
+    """Distances from the truth, metres and radians; None where it is not known."""
+    if expected is None:
+        return None
+    distance, angle = pose_error(trajectory.wxyz_xyz[0], expected.wxyz_xyz[0])
+    return {
+        "pick_metres": float(distance),
+        "pick_radians": float(angle),
+        "path_metres": path_error(trajectory, expected),
+    }
+
+
+def _title(loss: float, found: dict | None) -> str:
+    """One line over the picture."""
+    if found is None:
+        return f"loss {loss:.4f}; pick and path errors n/a"
+    angle = np.degrees(found["pick_radians"])
+    pick = f"pick-pose error {100 * found['pick_metres']:.1f} cm, {angle:.0f}°"
+    return f"loss {loss:.4f}; {pick}; path error {100 * found['path_metres']:.1f} cm"
+
+
+def _record(
+    settings: Settings,
+    model: Model,
+    scene: Scene,
+    energy: EnergyWeights | None,
+    config: CarryConfig | SolveConfig | OptimizeConfig,
+    result: Result,
+    timings: dict[str, float],
+) -> dict:
+    """Everything about a run that result.json holds; numbers that are not finite are null."""
+    trajectory = result.trajectory
+    expected = scene.expected(trajectory.wxyz_xyz[-1], trajectory.wxyz_xyz[0])
+    demonstration = scene.demonstration
+    return {
+        "schema": SCHEMA,
+        "tdf_jax": tdf_jax.__version__,
+        "seed": settings.seed,
+        "settings": {name: _plain(value) for name, value in dataclasses.asdict(settings).items()},
+        "energy": None if energy is None else dataclasses.asdict(energy),
+        "optimiser": dataclasses.asdict(config),
+        "weights": dataclasses.asdict(model.info),
+        "machine": {"jax": jax.__version__, "device": jax.devices()[0].device_kind, "backend": jax.default_backend()},
+        "demonstration": {
+            "points": len(demonstration.points),
+            "poses": demonstration.trajectory.poses,
+            "queries": len(demonstration.query),
+        },
+        "target": {"points": len(scene.points), "T_world_target": scene.T_world_target.tolist()},
+        "status": result.status,
+        "best": result.best,
+        "loss": {"start": float(result.losses[result.best, 0]), "end": result.loss},
+        "confidence": result.confidence,
+        "recognised": result.recognised,
+        "modes": _modes(config, result),
+        "errors": _errors(trajectory, expected),
+        "goal": _plain(trajectory.wxyz_xyz[-1]),
+        "expected": None if expected is None else _plain(expected.wxyz_xyz),
+        "energies": _plain(result.energies),
+        "losses": _plain(result.losses),
+        "seconds": {name: round(value, 3) for name, value in timings.items()},
+    }
+
+
+def _table(record: dict, out: Path) -> str:
+    """The record in a few lines."""
+    found, seconds = record["errors"], record["seconds"]
+    optimiser = record["optimiser"]
+    sizes = record["demonstration"] | optimiser
+    if record["modes"] is not None:
+        starts, best = "{scouts} starts of the pick", "of the best pick"
+    elif "scouts" in sizes:
+        starts, best = "{inits} starts, {scouts} of the keyframe", "the best candidate of every waypoint"
+    else:
+        starts, best = "{inits} starts, {iterations} iterations", f"start {record['best'] + 1} of {sizes['inits']}; {record['status']}"
+    parts = ", ".join(f"{name} {value:.1f}" for name, value in seconds.items() if name != "total")
+    pick = path = "n/a (the truth is not known)"
+    if found is not None:
+        pick = f"{100 * found['pick_metres']:.2f} cm, {np.degrees(found['pick_radians']):.1f} degrees"
+        path = f"{100 * found['path_metres']:.2f} cm, mean over waypoints"
+    rows = {
+        "run": f"{starts}, {{poses}} poses, {{queries}} queries".format(**sizes),
+        "loss, start": f"{record['loss']['start']:.5f}",
+        "loss, end": f"{record['loss']['end']:.5f} ({best})",
+        "pick-pose error": pick,
+        "path error": path,
+        "time": f"{seconds['total']:.1f} s ({parts})",
+        "written to": str(out),
+    }
+    if record["modes"] is not None:
+        rows["solutions"] = _solutions(record["modes"])
+    if record["recognised"] is not None:
+        rows["recognised"] = f"{record['recognised']:.2f} that the object is of the demonstration's category"
+    if record["confidence"] is not None:
+        rows["confidence"] = f"{record['confidence']:.2f} that the pick is right to 2 cm and 20 degrees"
+    return "\n".join(f"{name:<17}{value}" for name, value in rows.items())
+
+
+def _modes(config, result) -> list[dict] | None:
+    """The distinct picks; None for methods that do not bring them to their minima."""
+    if not isinstance(config, CarryConfig):
+        return None
+    modes = cluster_poses(result.trajectories[:, 0], result.energies)
+    return [{"pick": _plain(mode.pose), "energy": mode.energy, "share": mode.share} for mode in modes]
+
+
+def _solutions(modes: list[dict]) -> str:
+    """How many distinct picks there are, and how far behind the second is."""
+    told = f"{len(modes)} distinct pick{'s' if len(modes) != 1 else ''}"
+    return told if len(modes) < 2 else f"{told}; the second's loss is {modes[1]['energy']:.5f}"
+
+
+def _plain(value):
+    """A value as JSON has it."""
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, jax.Array | np.ndarray):
+        return _plain(np.asarray(value).tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value

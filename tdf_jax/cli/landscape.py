@@ -15,24 +15,24 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from tdf_jax.landscape import shared_lattice as lattice
-from tdf_jax.geometry import se3 as poses
-from tdf_jax.networks.checkpoint import load_model
-from tdf_jax.cli.scene import make_scene
-from tdf_jax.cli.options import LandscapeSettings, resolved
-from tdf_jax.energy.reference import Reference, describe
 from tdf_jax._internal.errors import InputError
-from tdf_jax.evaluation.scene import Scene
-from tdf_jax.networks.field import DescriptorField
 from tdf_jax._internal.files import replace_file, replace_folder
+from tdf_jax.cli.options import LandscapeSettings, make_scene, resolved
+from tdf_jax.energy.reference import Reference, describe
+from tdf_jax.evaluation.scene import Scene
+from tdf_jax.geometry import se3 as poses
 from tdf_jax.geometry.grid import PLANES, Grid, distance_from_polyline, path_grid, plane_grid, volume_grid
-from tdf_jax.landscape.storage import Landscape, load_landscape, save_landscape
-from tdf_jax.io.meshes import libigl
-from tdf_jax.networks.model import encode
-from tdf_jax.solvers.adam import default_goal
 from tdf_jax.geometry.query import lattice_query, snapped_query
-from tdf_jax.landscape.shortest_path import lowest_cost_path
+from tdf_jax.geometry.winding import libigl
+from tdf_jax.landscape import shared_lattice as lattice
 from tdf_jax.landscape.energy_grid import blank, fill, query_change
+from tdf_jax.landscape.shortest_path import lowest_cost_path
+from tdf_jax.landscape.storage import Landscape, load_landscape, save_landscape
+from tdf_jax.networks.checkpoint import load_model
+from tdf_jax.networks.encoding import encode
+from tdf_jax.networks.field import DescriptorField
+from tdf_jax.solvers.initial import default_goal
+from tdf_jax.viz import html
 
 RESULT = "result.json"
 NAMES = (RESULT, "landscape.npz", "map.png", "isosurface.png", "slices.gif", "landscape.html")
@@ -128,7 +128,7 @@ def _check_extras(settings) -> None:
     if settings.grid not in PLANES:
         libigl("tdf landscape")
     if not settings.no_page:
-        from tdf_jax.viz.landscapes import pages
+        from tdf_jax.viz.html import pages
 
         pages("tdf landscape")
 
@@ -208,7 +208,7 @@ def _draw(settings, folder: Path, scene: Scene, found: Landscape, expected, path
         save_figure(folder / "isosurface.png", terrain.isosurface_figure(found, marks))
         terrain.save_slices(folder / "slices.gif", found, marks)
     if not settings.no_page:
-        terrain.save_page(folder / "landscape.html", found, marks, "Energy landscape")
+        html.save_page(folder / "landscape.html", found, marks, "Energy landscape")
 
 
 def _record(settings, found: Landscape, reference, change, waypoints, expected, path, seconds) -> dict:

@@ -1,13 +1,12 @@
 """Descriptors of poses and trajectories: the point descriptors of the query points they carry."""
 
 import jax
-import numpy as np
 from jaxtyping import Array, Float
 
+from tdf_jax._internal.checks import check_query
 from tdf_jax.geometry import se3 as poses
-from tdf_jax._internal.errors import InputError
-from tdf_jax.networks.field import DescriptorField
 from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.networks.field import DescriptorField
 
 
 def pose_descriptor(
@@ -38,12 +37,3 @@ def trajectory_descriptor(
         query: points in the query frame, metres.
     """
     return jax.lax.map(lambda T_world_query: pose_descriptor(field, T_world_query, query), trajectory.wxyz_xyz)
-
-
-def check_query(function: str, query) -> None:
-    """Raise InputError unless query points are (queries, 3), at least one, and finite."""
-    shape = np.shape(query)
-    if len(shape) != 2 or shape[1] != 3 or shape[0] < 1:
-        raise InputError(f"{function}: query points have shape {shape}; expected (queries, 3). Try tdf.box_query(key, count=500)")
-    if not isinstance(query, jax.core.Tracer) and not np.isfinite(np.asarray(query)).all():
-        raise InputError(f"{function}: some query points are NaN or infinite; expected finite metres")

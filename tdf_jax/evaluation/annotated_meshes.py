@@ -21,11 +21,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tdf_jax._internal.errors import InputError
-from tdf_jax.evaluation.places import body, measured_places
 from tdf_jax.evaluation.axis_profiles import profile, profile_places
-from tdf_jax.io.meshes import AXES, MESH_SUFFIXES, file_axes, inside, load_mesh
+from tdf_jax.evaluation.places import body, measured_places
+from tdf_jax.geometry.symmetry import FOLDS
+from tdf_jax.geometry.winding import inside
+from tdf_jax.io.meshes import AXES, MESH_SUFFIXES, file_axes, load_mesh
 from tdf_jax.shapes import FAMILIES
-from tdf_jax.geometry.symmetry import FOLDS, ROUND
 
 if TYPE_CHECKING:
     import trimesh

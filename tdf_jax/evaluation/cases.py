@@ -7,11 +7,11 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from tdf_jax.geometry import se3 as poses
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.annotated_meshes import AnnotatedMesh
 from tdf_jax.evaluation.conditions import CONDITIONS, SCALES, observed
-from tdf_jax.io.meshes import sample_surface
+from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.shapes import FAMILIES, Mug, Shape, scaled
 
 SEED_SPACE = 7_000_001  # keeps evaluation objects apart from training's, which are drawn from [seed, index]

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from tdf_jax.io.meshes import sample_surface
+from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.geometry.views import cameras, visible
 
 if TYPE_CHECKING:

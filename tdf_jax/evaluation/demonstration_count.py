@@ -11,17 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from tdf_jax.geometry import se3 as poses
-from tdf_jax.evaluation.methods import EVERY, STREAM
-from tdf_jax.evaluation.path_tasks import Task
-from tdf_jax.solvers.pick import carry
-from tdf_jax.energy.reference import COMBINATIONS, Demonstration, Reference, describe
-from tdf_jax.evaluation.cases import mug_of
-from tdf_jax.evaluation.metrics import pose_error
 from tdf_jax._internal.files import kept
-from tdf_jax.io.meshes import sample_surface
-from tdf_jax.networks.model import Model, encode, fingerprint
+from tdf_jax.energy.reference import COMBINATIONS, Reference, describe
+from tdf_jax.evaluation.cases import mug_of
+from tdf_jax.evaluation.methods import EVERY, STREAM
+from tdf_jax.evaluation.metrics import pose_error
+from tdf_jax.evaluation.path_tasks import Task
+from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry.demonstration import Demonstration
+from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.networks.encoding import encode
+from tdf_jax.networks.model import Model, fingerprint
+from tdf_jax.solvers.pick import carry
 
 FORMAT = 1  # of what is kept
 MUGS, MOST = 1_000_000_000, 100  # demonstrated mugs are numbered from here, apart from those of the tasks; so many a task

@@ -1,7 +1,7 @@
 """What imitates a task: the library, the paper's energy, and baselines from copying to an oracle.
 
 A method's rows are its starts (of the solver: the candidates it ends with), each a whole trajectory that ends at the goal, with a score that its best is chosen by.
-Methods that find one motion of the object carry the demonstration as the library does (`tdf_jax.solvers.pick.carry_trajectory`), unless their name says otherwise.
+Methods that find one motion of the object carry the demonstration as the library does (`tdf_jax.geometry.transport.carry_trajectory`), unless their name says otherwise.
 """
 
 import dataclasses
@@ -14,19 +14,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 
-from tdf_jax.geometry import se3 as poses
-from tdf_jax.evaluation.path_tasks import Task, carried_by
-from tdf_jax.solvers.pick import carry, carry_to_picks
-from tdf_jax.energy.reference import Reference, describe
 from tdf_jax.energy.losses import EnergyWeights
+from tdf_jax.energy.reference import Reference, describe
 from tdf_jax.evaluation.baselines import principal_axes, rigid_motion, settled_points
 from tdf_jax.evaluation.comparison import random_weights
-from tdf_jax.networks.field import DescriptorField
-from tdf_jax.networks.model import Model, encode
-from tdf_jax.solvers.adam import OptimizeConfig, Result, optimize
-from tdf_jax.shapes import Mug
-from tdf_jax.solvers.multistart import SolveConfig, solve
+from tdf_jax.evaluation.path_tasks import Task, carried_by
+from tdf_jax.geometry import se3 as poses
 from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.geometry.transport import carry_to_picks
+from tdf_jax.networks.encoding import encode
+from tdf_jax.networks.field import DescriptorField
+from tdf_jax.networks.model import Model
+from tdf_jax.shapes import Mug
+from tdf_jax.solvers.adam import OptimizeConfig, optimize
+from tdf_jax.solvers.multistart import SolveConfig, solve
+from tdf_jax.solvers.pick import carry
+from tdf_jax.solvers.result import Result
 
 LIBRARY = "tdf_jax"
 NEAR = 0.04  # metres from the pick within which the oracle's correspondences count

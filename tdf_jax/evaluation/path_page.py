@@ -12,10 +12,9 @@ import numpy as np
 from tdf_jax.evaluation import path_tasks as tasks
 from tdf_jax.evaluation.demonstration_count import Learnt
 from tdf_jax.evaluation.methods import EVERY, LIBRARY, NEAR
-from tdf_jax.uncertainty.reliability import bins, calibration_error, ranking
 from tdf_jax.evaluation.path_scores import MISSED, THRESHOLDS, Score, by_method, interval, summarised
-from tdf_jax.uncertainty.calibration import FITTED_ON
 from tdf_jax.networks.model import Model
+from tdf_jax.uncertainty.calibration import FITTED_ON, bins, calibration_error, ranking
 
 PICTURES = {"truth": "truth.png", "errors": "errors.png", "reliability": "reliability.png", "demonstrations": "demonstrations.png"}
 SCHEMA = 1  # raised when a field of the file changes its meaning or goes

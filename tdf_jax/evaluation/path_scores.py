@@ -7,12 +7,11 @@ import numpy as np
 from jaxtyping import Float
 
 from tdf_jax.evaluation.methods import Attempt
+from tdf_jax.evaluation.metrics import FLIP_DEGREES, frechet_distance, jerk, longest_step, penetration, pose_error
 from tdf_jax.evaluation.path_tasks import Task
-from tdf_jax.uncertainty.calibration import confidence
-from tdf_jax.evaluation.motion import frechet_distance, jerk, longest_step, penetration
 from tdf_jax.evaluation.statistics import RESAMPLES
-from tdf_jax.evaluation.metrics import FLIP_DEGREES, pose_error
 from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.uncertainty.calibration import confidence
 
 THRESHOLDS = {"1cm_10deg": (0.01, 10.0), "2cm_20deg": (0.02, 20.0), "5cm_30deg": (0.05, 30.0)}  # metres, degrees
 LEAST_JERK = 1e-4  # metres

@@ -7,13 +7,13 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from tdf_jax.geometry import se3 as poses
-from tdf_jax.energy.reference import Demonstration
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.cases import SEED_SPACE, Case
-from tdf_jax.evaluation.scene import place_demonstration
-from tdf_jax.evaluation.pick_transfer import QUERIES, QUERY_SIZE
 from tdf_jax.evaluation.metrics import expected_trajectory
+from tdf_jax.evaluation.pick_transfer import QUERIES, QUERY_SIZE
+from tdf_jax.evaluation.scene import place_demonstration
+from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.paths import PATHS
 from tdf_jax.geometry.query import box_query
 from tdf_jax.geometry.trajectory import Trajectory

@@ -8,17 +8,18 @@ import numpy as np
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
-from tdf_jax.geometry import se3 as poses
-from tdf_jax.energy.reference import Reference
 from tdf_jax.energy.descriptors import pose_descriptor
 from tdf_jax.energy.losses import EnergyWeights
+from tdf_jax.energy.reference import Reference
 from tdf_jax.evaluation.cases import Case, Transfer
 from tdf_jax.evaluation.metrics import nearest_place, pose_error
-from tdf_jax.networks.model import Model, encode
-from tdf_jax.solvers.adam import OptimizeConfig, optimize
+from tdf_jax.geometry import se3 as poses
 from tdf_jax.geometry.query import box_query
-from tdf_jax.networks.refinement import refine
 from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.networks.encoding import encode
+from tdf_jax.networks.model import Model
+from tdf_jax.networks.refinement import refine
+from tdf_jax.solvers.adam import OptimizeConfig, optimize
 
 OVERLAPS = ("iou", "iou_refined")
 QUERIES = 128

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jax
 
-import tdf_jax
+from importlib.metadata import version
 from tdf_jax.evaluation.comparison import Outcome
 from tdf_jax.evaluation.pick_transfer import OVERLAPS
 from tdf_jax._internal.files import replace_file
@@ -108,7 +108,7 @@ def record(outcomes: Outcomes, settings: dict, model: Model) -> dict:
     ]
     return {
         "schema": SCHEMA,
-        "tdf_jax": tdf_jax.__version__,
+        "tdf_jax": version("tdf_jax"),
         "settings": settings,
         "weights": {"name": model.info.name, "source": model.info.source},
         "machine": {"jax": jax.__version__, "backend": jax.default_backend()},

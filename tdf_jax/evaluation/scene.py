@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Array, Float
 
-from tdf_jax.energy.reference import Demonstration
 from tdf_jax.evaluation.cases import Case
 from tdf_jax.evaluation.metrics import expected_trajectory, nearest_place
+from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.paths import PATHS, SHAPES
 from tdf_jax.geometry.trajectory import Trajectory
 

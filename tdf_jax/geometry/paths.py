@@ -5,10 +5,10 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from tdf_jax.geometry import se3
+from tdf_jax._internal.checks import check_count, check_rotations, checked_vector
 from tdf_jax._internal.errors import InputError
-from tdf_jax.geometry.trajectory import Trajectory, check_count, check_rotations, checked_vector, resample
-
+from tdf_jax.geometry import se3
+from tdf_jax.geometry.trajectory import Trajectory, resample
 
 UPRIGHT = 0.6  # of the way across, before `tilt_and_pour` tilts
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     import trimesh
 
 from tdf_jax._internal.errors import InputError
-from tdf_jax.io.meshes import sample_surface
+from tdf_jax.geometry.sampling import sample_surface
 
 PIXELS = 160  # across twice the object's radius: 1.3 mm on a real mug
 OCCLUDERS = 100_000  # points that fill the depth buffer; too few leave gaps through which hidden points show

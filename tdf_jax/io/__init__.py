@@ -1,0 +1,7 @@
+"""Files: reading and writing, and nothing else.
+
+    demonstrations  demonstrations as .npz
+    meshes          meshes: .obj .stl .ply .glb .off
+    pointclouds     clouds: .ply .pcd .xyz .npy .npz
+    trajectories    trajectories as .npz and .tum
+"""

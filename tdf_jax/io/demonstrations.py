@@ -7,9 +7,9 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from tdf_jax.energy.reference import Demonstration
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
+from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory
 
 ARRAYS = ("points", "wxyz_xyz", "query")

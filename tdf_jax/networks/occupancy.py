@@ -24,12 +24,17 @@ from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Bool, Float
 
 from tdf_jax._internal.precision import full_precision
+from tdf_jax.networks.vector_neurons import (
+    EdgeConvolution,
+    VectorLeakyReLU,
+    VectorLinear,
+    VectorResidualBlock,
+    vector_dot,
+    map_planes,
+    farthest,
+)
 
-Vectors = tuple[Float[Array, "points channels"], Float[Array, "points channels"], Float[Array, "points channels"]]
-
-VECTOR_EPSILON = 1e-6  # added to |d|^2 in the vector leaky ReLU, as in the original
 NORM_FLOOR = 1e-12  # least norm a descriptor is divided by, as in the original
-NEIGHBOUR_ROWS = 2048  # points whose distances to all others exist at a time
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,204 +68,6 @@ class NetworkConfig:
     def channels(self) -> int:
         """Numbers in one point descriptor: 2049 at the default sizes."""
         return 2 * self.latent + 1 + (self.blocks + 1) * self.decoder_width
-
-
-class VectorMap(nn.Module):
-    """A linear map of vector channels; no bias, so it commutes with rotations."""
-
-    inputs: int
-    outputs: int
-
-    def setup(self):
-        # Standard deviation 1/sqrt(inputs) keeps the variance from layer to layer. PyTorch's default is smaller by sqrt(3);
-        # through the encoder's depth that starts the latent at rms 1e-4, and the decoder then sees nothing but |p|^2.
-        self.kernel = self.param("kernel", nn.initializers.lecun_normal(), (self.inputs, self.outputs))
-
-    def __call__(self, x: Vectors) -> Vectors:
-        return _map(lambda plane: plane @ self.kernel, x)
-
-
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _cross(a, b):
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-
-
-def _map(function, *planes):
-    return tuple(function(*plane) for plane in zip(*planes))
-
-
-def _reflection(inner, squared, slope):
-    """Coefficient of the direction in a vector leaky ReLU, from <x,d> and |d|^2."""
-    return jnp.minimum(inner, 0.0) * ((1.0 - slope) / (squared + VECTOR_EPSILON))
-
-
-def _reflect(x, direction, slope):
-    """Vector leaky ReLU: `x` where <x,d> >= 0, else `x` less (1 - slope) of its part along `d`."""
-    coefficient = _reflection(_dot(x, direction), _dot(direction, direction), slope)
-    return _map(lambda a, d: a - coefficient * d, x, direction)
-
-
-class VectorLinear(nn.Module):
-    """`VectorMap` under the name the published checkpoints give it."""
-
-    inputs: int
-    outputs: int
-
-    def setup(self):
-        self.map_to_feat = VectorMap(self.inputs, self.outputs)
-
-    def __call__(self, x):
-        return self.map_to_feat(x)
-
-
-class VectorLeakyReLU(nn.Module):
-    """Vector leaky ReLU with a learned direction for every channel."""
-
-    channels: int
-    slope: float
-
-    def setup(self):
-        self.map_to_dir = VectorMap(self.channels, self.channels)
-
-    def __call__(self, x):
-        return _reflect(x, self.map_to_dir(x), self.slope)
-
-
-class EdgeConvolution(nn.Module):
-    """Edge features of the nearest neighbours, a vector linear map, a vector leaky ReLU and the mean over neighbours.
-
-    The edge features of a neighbour are e = neighbour - x, x, and c = neighbour x x = e x x. The (points, neighbours,
-    3, channels) activations are never formed: <feature,d> and |d|^2 are linear in the scalar products of (e, x, c),
-    of which only four differ from zero (c is normal to e and x), and the mean over neighbours needs only the mean of s and of
-    s e, s being the reflection's coefficient: the mean of s x is (mean s) x, that of s c is (mean s e) x x.
-    Equal to the plain form to rounding, and without its memory.
-    """
-
-    channels: int
-    neighbours: int
-    slope: float
-
-    def setup(self):
-        self.map_to_feat = VectorMap(3, self.channels)
-        self.map_to_dir = VectorMap(3, self.channels)
-
-    def __call__(self, points: Float[Array, "points 3"], used: Bool[Array, "points"] | None = None) -> Vectors:
-        kernels = self.map_to_feat.kernel, self.map_to_dir.kernel
-        # Promoted first: products of float32 kernels would round away what float64 points ask for.
-        feature, direction = (kernel.astype(jnp.promote_types(kernel.dtype, points.dtype)) for kernel in kernels)
-        own = tuple(points.T)  # planes (points,)
-        spread = _map(lambda plane: plane[:, None], own)
-        neighbours = points[nearest_neighbours(points, self.neighbours, used)]
-        edge = _map(lambda a, x: a - x, tuple(jnp.moveaxis(neighbours, -1, 0)), spread)  # planes (points, neighbours)
-        cross = _cross(edge, spread)
-        products = _dot(edge, edge), _dot(edge, spread), _dot(spread, spread), _dot(cross, cross)
-        # Four terms written out, not a matrix product, which is not fused with what follows: 5 ms for 1500 points instead of 16.
-        inner, squared = (
-            sum(product[:, :, None] * weight for product, weight in zip(products, _bilinear(kernel, direction)))
-            for kernel in (feature, direction)
-        )
-        reflection = _reflection(inner, squared, self.slope)  # (points, neighbours, channels)
-
-        mean_reflection = jnp.mean(reflection, axis=1)
-        mean_reflected_edge = _map(lambda e: jnp.mean(e[:, :, None] * reflection, axis=1), edge)
-        mean_edge = _map(lambda e: jnp.mean(e, axis=1), edge)
-        features = zip(mean_edge, own, _cross(mean_edge, own))
-        linear = tuple(jnp.stack(feature_planes, axis=-1) @ feature for feature_planes in features)
-        reflected_cross = _cross(mean_reflected_edge, spread)
-        return _map(
-            lambda x, e, o, c: x - e * direction[0] - o * mean_reflection * direction[1] - c * direction[2],
-            *(linear, mean_reflected_edge, spread, reflected_cross),
-        )
-
-
-def _bilinear(a, b):
-    """Weights of (e.e, e.x, x.x, c.c) in <f a, f b>, with f = (e, x, c)."""
-    return a[0] * b[0], a[0] * b[1] + a[1] * b[0], a[1] * b[1], a[2] * b[2]
-
-
-def nearest_neighbours(points: Float[Array, "points 3"], count: int, used: Bool[Array, "points"] | None = None):
-    """Indices (points, count) of the nearest points, or of those used, by Euclidean distance, the point itself included."""
-    points = jax.lax.stop_gradient(points)
-
-    def nearest(x):
-        # Differences, not |a|^2 + |b|^2 - 2ab: in float32 the latter misorders near neighbours of a cloud far from zero.
-        squared = sum((points[:, axis] - x[axis]) ** 2 for axis in range(3))
-        squared = squared if used is None else jnp.where(used, squared, jnp.inf)
-        return jax.lax.top_k(-squared, count)[1]
-
-    # In blocks, for all distances of a dense cloud do not fit: 6 GB at 40,000 points.
-    return jax.lax.map(nearest, points, batch_size=NEIGHBOUR_ROWS)
-
-
-def farthest(points: Float[Array, "points 3"], used: Bool[Array, "points"] | None = None) -> Float[Array, "3"]:
-    """The point of a centred cloud, or of those used, that is farthest from its mean."""
-    squared = jnp.sum(points**2, axis=1)
-    return points[jnp.argmax(squared if used is None else jnp.where(used, squared, -1))]
-
-
-class VectorResidualBlock(nn.Module):
-    """`shortcut(x) + fc_1(act_1(fc_0(act_0(x))))` on vector channels."""
-
-    inputs: int
-    outputs: int
-    slope: float
-
-    def setup(self):
-        self.actvn_0 = VectorLeakyReLU(self.inputs, self.slope)
-        self.fc_0 = VectorLinear(self.inputs, self.outputs)
-        self.actvn_1 = VectorLeakyReLU(self.outputs, self.slope)
-        self.fc_1 = VectorLinear(self.outputs, self.outputs)
-        self.shortcut = VectorLinear(self.inputs, self.outputs)
-
-    def __call__(self, x: Vectors, pooled: Vectors | None = None) -> Vectors:
-        """Args: x, and `pooled`, one point's channels to append to every point's, or None."""
-        # What is linear in the pooled half is computed once, not once for every point: 651,000 multiply-adds
-        # a point and axis instead of 847,000.
-        direction = _split_map(self.actvn_0.map_to_dir, x, pooled)
-        shortcut = _split_map(self.shortcut.map_to_feat, x, pooled)
-        if pooled is not None:
-            x = _map(lambda a, b: jnp.concatenate([a, jnp.broadcast_to(b, a.shape[:1] + b.shape[1:])], axis=-1), x, pooled)
-        hidden = self.fc_1(self.actvn_1(self.fc_0(_reflect(x, direction, self.slope))))
-        return _map(jnp.add, shortcut, hidden)
-
-
-def _split_map(linear, x, pooled):
-    """`linear` of [x, pooled] along channels, without forming it."""
-    if pooled is None:
-        return linear(x)
-    width = x[0].shape[-1]
-    return _map(lambda a, b: a @ linear.kernel[:width] + b @ linear.kernel[width:], x, pooled)
-
-
-class Encoder(nn.Module):
-    """The vector-neuron PointNet: a centred cloud -> a latent that turns with it, exactly."""
-
-    config: NetworkConfig
-
-    def setup(self):
-        config = self.config
-        hidden, width = config.vector_hidden, config.vector_width
-        self.conv_pos = EdgeConvolution(hidden, config.neighbours, config.slope)
-        self.fc_pos = VectorLinear(hidden, width)
-        for index in range(config.blocks):
-            setattr(self, f"block_{index}", VectorResidualBlock(width, hidden, config.slope))
-        self.actvn_c = VectorLeakyReLU(hidden, config.slope)
-        self.fc_c = VectorLinear(hidden, config.latent)
-
-    def __call__(
-        self, points: Float[Array, "points 3"], used: Bool[Array, "points"] | None = None, tip: Float[Array, "3"] | None = None
-    ) -> Float[Array, "latent 3"]:
-        if self.config.asymmetry:
-            points = points - self.config.asymmetry * (farthest(points, used) if tip is None else tip)
-        where = None if used is None else used[:, None]
-        x, pooled = self.fc_pos(self.conv_pos(points * self.config.scaling, used)), None
-        for index in range(self.config.blocks):
-            x = getattr(self, f"block_{index}")(x, pooled)
-            pooled = _map(lambda plane: jnp.mean(plane, axis=0, keepdims=True, where=where), x)
-        return jnp.concatenate(self.fc_c(self.actvn_c(pooled))).T
 
 
 class Affine(nn.Module):
@@ -327,7 +134,7 @@ class Decoder(nn.Module):
     def __call__(self, latent: Float[Array, "latent 3"]) -> Conditioned:
         size = self.config.latent
         planes = tuple(latent.T)
-        invariants = _dot(planes, self.z_in(planes))
+        invariants = vector_dot(planes, self.z_in(planes))
         square, linear, constant = jnp.split(self.fc_in.kernel, [1, 1 + size])
         blocks = [getattr(self, f"block{index}") for index in range(self.config.blocks)]
         return Conditioned(
@@ -427,3 +234,31 @@ def parameter_shapes(config: NetworkConfig) -> Mapping[str, tuple[int, ...]]:
 
 def parameter_count(config: NetworkConfig) -> int:
     return sum(math.prod(shape) for shape in parameter_shapes(config).values())
+
+
+class Encoder(nn.Module):
+    """The vector-neuron PointNet: a centred cloud -> a latent that turns with it, exactly."""
+
+    config: NetworkConfig
+
+    def setup(self):
+        config = self.config
+        hidden, width = config.vector_hidden, config.vector_width
+        self.conv_pos = EdgeConvolution(hidden, config.neighbours, config.slope)
+        self.fc_pos = VectorLinear(hidden, width)
+        for index in range(config.blocks):
+            setattr(self, f"block_{index}", VectorResidualBlock(width, hidden, config.slope))
+        self.actvn_c = VectorLeakyReLU(hidden, config.slope)
+        self.fc_c = VectorLinear(hidden, config.latent)
+
+    def __call__(
+        self, points: Float[Array, "points 3"], used: Bool[Array, "points"] | None = None, tip: Float[Array, "3"] | None = None
+    ) -> Float[Array, "latent 3"]:
+        if self.config.asymmetry:
+            points = points - self.config.asymmetry * (farthest(points, used) if tip is None else tip)
+        where = None if used is None else used[:, None]
+        x, pooled = self.fc_pos(self.conv_pos(points * self.config.scaling, used)), None
+        for index in range(self.config.blocks):
+            x = getattr(self, f"block_{index}")(x, pooled)
+            pooled = map_planes(lambda plane: jnp.mean(plane, axis=0, keepdims=True, where=where), x)
+        return jnp.concatenate(self.fc_c(self.actvn_c(pooled))).T

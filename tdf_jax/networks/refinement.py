@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from tdf_jax._internal.checks import check_points
 from tdf_jax._internal.errors import InputError
 from tdf_jax.networks.field import DescriptorField
 from tdf_jax.networks.model import Model
 from tdf_jax.networks.occupancy import condition, decode
-from tdf_jax.io.pointclouds import check_points
 
 POINTS = 1500  # of the cloud that are used: one size, so that clouds of all sizes run one program
 RATE = 0.003  # length of the first step, of the latent's root mean square vector; twice as much fits the noise of 2 mm, six times destroys the shape

@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from tdf_jax.energy.reference import describe
 from tdf_jax.energy.losses import descriptor_loss, trajectory_energy
-from tdf_jax.evaluation.motion import longest_step
-from tdf_jax.evaluation.metrics import FLIP_DEGREES, pose_error, shape_error
+from tdf_jax.energy.reference import describe
+from tdf_jax.evaluation.metrics import FLIP_DEGREES, longest_step, pose_error, shape_error
+from tdf_jax.geometry.grid import distance_from_polyline
+from tdf_jax.networks.encoding import encode
+from tdf_jax.networks.model import Model
 from tdf_jax.paper import setting as settings
 from tdf_jax.paper.setting import Setting
-from tdf_jax.geometry.grid import distance_from_polyline
-from tdf_jax.networks.model import Model, encode
 from tdf_jax.solvers.adam import optimize
 
 SETTLED = 0.95  # of the loss's drop
@@ -102,7 +102,7 @@ class Run:
 
     @property
     def longest_step(self) -> float:
-        """See `tdf_jax.evaluation.motion.longest_step`; the demonstration's is 1 where it is evenly spaced."""
+        """See `tdf_jax.evaluation.metrics.longest_step`; the demonstration's is 1 where it is evenly spaced."""
         return longest_step(self.trajectory[:, 4:])
 
 

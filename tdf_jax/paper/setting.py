@@ -8,18 +8,20 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from tdf_jax.energy.reference import Demonstration, Reference
-from tdf_jax.energy.losses import COMPENSATOR_ORDERS, POSE_NORMS, EnergyWeights
 from tdf_jax._internal.errors import InputError
+from tdf_jax.energy.losses import COMPENSATOR_ORDERS, POSE_NORMS, EnergyWeights
+from tdf_jax.energy.reference import Reference
 from tdf_jax.evaluation.cases import mug_of
 from tdf_jax.evaluation.scene import Scene
-from tdf_jax.networks.field import DescriptorField
-from tdf_jax.io.meshes import sample_surface
-from tdf_jax.solvers.adam import STARTS, OptimizeConfig, default_goal
+from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.paths import SHAPES
 from tdf_jax.geometry.query import box_query, gaussian_query
-from tdf_jax.shapes import Mug, scaled
+from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.networks.field import DescriptorField
+from tdf_jax.shapes import Mug, scaled
+from tdf_jax.solvers.adam import OptimizeConfig
+from tdf_jax.solvers.initial import STARTS, default_goal
 
 QUERIES = ("box", "gaussian")
 CORRELATED = ("demonstration", "stretched")

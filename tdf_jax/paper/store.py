@@ -7,7 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from tdf_jax.paper.figure2 import Swept, figure2
+from tdf_jax.paper.energy_maps import Swept, figure2
 from tdf_jax.paper.runs import Run, imitation
 from tdf_jax.paper.setting import SHAPES, Setting
 from tdf_jax._internal.files import kept
@@ -34,7 +34,7 @@ class Store:
         return self._kept(["run", setting], lambda: dataclasses.asdict(imitation(self.model, setting)), lambda arrays: Run(**arrays))
 
     def landscapes(self, base: Setting, field: str, count: int) -> dict[str, Swept]:
-        """Figure 2 of one field, see `tdf_jax.paper.figure2.figure2`."""
+        """Figure 2 of one field, see `tdf_jax.paper.energy_maps.figure2`."""
 
         def swept():
             panels = figure2(self.model, base, field, count)

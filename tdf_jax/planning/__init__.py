@@ -1,0 +1,6 @@
+"""Trajectories that keep clear of obstacles.
+
+    avoidance  `push_clear`
+    distances  `clearance`: distances of a moving body
+    occupied   an obstacle from a field
+"""

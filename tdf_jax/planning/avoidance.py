@@ -7,58 +7,38 @@ straight and its rotation along the geodesic.
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tdf_jax.geometry import se3
 from tdf_jax._internal.errors import InputError
-from tdf_jax.io.pointclouds import thin_indices
-from tdf_jax.geometry.trajectory import Trajectory, check_trajectory
+from tdf_jax.geometry import se3
+from tdf_jax.geometry.sampling import thin_indices
+from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.planning.distances import (
+    ROUNDING,
+    STEP,
+    Obstacle,
+    distances_and_normals,
+    motion_samples,
+    measure,
+    body_centres,
+    prepare,
+    path_lengths,
+)
 
-STEP = 0.005  # metres: no point of the body moves farther between two looks, so that a wall seen by none of them is thinner than what it sees in 5 mm
-MOST_BETWEEN = 255  # looks between two poses
 POINTS = 64  # of the body that a descent looks at: spread evenly, then some of those that were missed
 LOOK = 0.01  # metres that a point of the body moves at most between the looks of a descent, along the given path
 # Metres aimed at beyond what is required, in the descents one after the other: a detour is longer than the given path, and what it keeps at the
 # looks it does not quite keep between them.
 SLACK = 0.0015, 0.003, 0.006
-ROUNDING = 1e-5  # metres
 BEST = 4  # detours that are measured with the whole body
 # Heights of the detours over the chord's length and twice the body's radius, each in all directions around the chord.
 HEIGHTS = 0.3, 0.8, 2.0
 STIFF = 1e4, 1e6  # weight of what is missing, squared, first and last, over that of the deviation
 LONGEST = 0.1  # metres that a pose moves in one step
-
-
-class Obstacle(Protocol):
-    """What `tdf_jax.obstacles` makes, or any registered dataclass of arrays with this method."""
-
-    def distance(self, x: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
-        """Signed distances of points of the world, metres, negative inside."""
-
-
-@dataclass(frozen=True)
-class Clearance:
-    """Least signed distances between a body and obstacles along a trajectory, metres, negative inside.
-
-    Attributes:
-        waypoints: at each pose, from each obstacle.
-        segments: on the way from pose i to pose i + 1, both included.
-        between: poses looked at between two.
-    """
-
-    waypoints: Float[np.ndarray, "poses obstacles"]
-    segments: Float[np.ndarray, "segments obstacles"]
-    between: int
-
-    @property
-    def least(self) -> float:
-        """The least of all, metres."""
-        return float(min(self.waypoints.min(), self.segments.min(initial=np.inf)))
 
 
 @dataclass(frozen=True)
@@ -114,32 +94,6 @@ class Cleared:
     status: str
 
 
-def clearance(
-    trajectory: Trajectory, body: Float[Array, "points 3"], obstacles: Sequence[Obstacle], *, between: int | None = None
-) -> Clearance:
-    """Least signed distances between a body that is moved along a trajectory and obstacles, on the way too.
-
-    Args:
-        trajectory: T_world_query, at least one pose.
-        body: points of what moves, metres, query frame. What is between them is not seen: an obstacle thinner than their distance can pass.
-        obstacles: at least one.
-        between: poses to look at between two; by default so many that no point moves more than 5 mm (up to 255).
-
-    Returns:
-        The distances.
-
-    Raises:
-        InputError: the trajectory fails `check_trajectory`, the body is not finite points, there is no obstacle or one of another kind, or between is
-            not a whole number of 0 to 255.
-    """
-    wxyz_xyz, body, groups, order = _prepared("clearance", trajectory, body, obstacles)
-    if between is None:
-        between = _looks(wxyz_xyz, body, STEP) - 1
-    elif not isinstance(between, int | np.integer) or isinstance(between, bool) or not 0 <= between <= MOST_BETWEEN:
-        raise InputError(f"clearance(): between is {between!r}; expected a whole number of 0 to {MOST_BETWEEN}, or None")
-    return _measured(wxyz_xyz, body, groups, order, int(between))[0]
-
-
 def push_clear(
     trajectory: Trajectory,
     body: Float[Array, "points 3"],
@@ -179,12 +133,12 @@ def push_clear(
         raise InputError(f"push_clear(): config is {config!r}; expected a ClearanceConfig")
     if not (np.ndim(margin) == 0 and 0 <= margin < np.inf):
         raise InputError(f"push_clear(): margin is {margin}; expected a length of 0 or more, metres")
-    wxyz_xyz, body, groups, order = _prepared("push_clear", trajectory, body, obstacles)
+    wxyz_xyz, body, groups, order = prepare("push_clear", trajectory, body, obstacles)
     dtype = wxyz_xyz.dtype
-    looks = _looks(wxyz_xyz, body, STEP)
-    found, rows, _ = _measured(wxyz_xyz, body, groups, order, looks - 1)
+    looks = motion_samples(wxyz_xyz, body, STEP)
+    found, rows, _ = measure(wxyz_xyz, body, groups, order, looks - 1)
     ends = rows[[0, -1]]  # in the order of the groups
-    way = _way(wxyz_xyz, body, config.lever)
+    way = path_lengths(wxyz_xyz, body, config.lever)
 
     def required(at):
         """Of each obstacle, in the order of the groups, at lengths of the way."""
@@ -200,7 +154,7 @@ def push_clear(
         return _said(trajectory, found, short, 0.0, deep, True)
     clear, rest = [], [(wxyz_xyz, found, short)]
     if len(wxyz_xyz) > 2:
-        looks = _looks(wxyz_xyz, body, LOOK)
+        looks = motion_samples(wxyz_xyz, body, LOOK)
         at = np.interp(np.arange((len(way) - 1) * looks) / looks, np.arange(len(way)), way)
         wanted = required(at).astype(dtype).reshape(len(way) - 1, looks, -1)
         numbers = np.array([config.lever, config.deviation], dtype)
@@ -213,7 +167,7 @@ def push_clear(
             for i in np.argsort(cost, kind="stable")[:BEST]:
                 moved = poses[i].copy()
                 moved[[0, -1]] = wxyz_xyz[[0, -1]]
-                found, rows, nearest = _measured(moved, body, groups, order, _looks(moved, body, STEP) - 1)
+                found, rows, nearest = measure(moved, body, groups, order, motion_samples(moved, body, STEP) - 1)
                 short = excess(rows)
                 missed.append(nearest[short < -ROUNDING])
                 (rest if len(missed[-1]) else clear).append((moved, found, short))
@@ -224,7 +178,7 @@ def push_clear(
             points = np.concatenate([missed[: POINTS // 2], spread])[:POINTS]
     # They come in the order of their costs.
     wxyz_new, found, short = clear[0] if clear else max(rest, key=lambda candidate: candidate[2].min())
-    moved = np.linalg.norm(_middles(wxyz_new, body) - _middles(wxyz_xyz, body), axis=1).max()
+    moved = np.linalg.norm(body_centres(wxyz_new, body) - body_centres(wxyz_xyz, body), axis=1).max()
     return _said(Trajectory(jnp.asarray(wxyz_new)), found, short, float(moved), deep, bool(clear))
 
 
@@ -250,94 +204,9 @@ def _said(trajectory, found, short, deviation, deep, kept):
     return Cleared(trajectory, found.least, float(short.min()), deviation, kept and not deep, status)
 
 
-def _prepared(function, trajectory, body, obstacles):
-    """Checked arrays of the trajectory's type; obstacles of a kind stacked, and where each of these was in the list."""
-    wxyz_xyz = np.asarray(check_trajectory(trajectory).wxyz_xyz)
-    body = np.asarray(body)
-    if body.ndim != 2 or body.shape[1] != 3 or not len(body) or body.dtype.kind not in "fiu" or not np.isfinite(body).all():
-        raise InputError(f"{function}(): body has shape {body.shape}; expected points (points, 3) of finite metres in the query frame")
-    if not isinstance(obstacles, list | tuple) or not obstacles:
-        raise InputError(f"{function}(): obstacles are {obstacles!r}; expected a list of at least one, such as [box_obstacle(...)]")
-    kinds: dict[Any, list[int]] = {}
-    arrays = []
-    for i, obstacle in enumerate(obstacles):
-        leaves, tree = jax.tree.flatten(obstacle)
-        if not callable(getattr(obstacle, "distance", None)) or not leaves or not all(isinstance(leaf, jax.Array | np.ndarray) for leaf in leaves):
-            raise InputError(
-                f"{function}(): obstacles[{i}] is a {type(obstacle).__name__}; expected an obstacle of tdf_jax.obstacles, "
-                "or a registered dataclass of arrays with a method distance"
-            )
-        arrays.append([np.asarray(leaf, wxyz_xyz.dtype if jnp.issubdtype(leaf.dtype, jnp.floating) else None) for leaf in leaves])
-        kinds.setdefault((tree, *((leaf.shape, leaf.dtype) for leaf in leaves)), []).append(i)
-    groups = [jax.tree.unflatten(kind[0], [np.stack(parts) for parts in zip(*(arrays[i] for i in which))]) for kind, which in kinds.items()]
-    return wxyz_xyz, body.astype(wxyz_xyz.dtype), groups, np.concatenate([np.array(which) for which in kinds.values()])
-
-
-def _middles(wxyz_xyz, body):
-    """The middle of the body at each pose, in numpy: op by op, jax would compile each."""
-    w, v, middle = wxyz_xyz[:, :1].astype(float), wxyz_xyz[:, 1:4].astype(float), body.mean(axis=0, dtype=float)
-    return middle + 2 * np.cross(v, np.cross(v, middle) + w * middle) / (w**2 + np.sum(v**2, axis=1, keepdims=True)) + wxyz_xyz[:, 4:]
-
-
-def _turns(wxyz_xyz):
-    """Angles between neighbouring poses."""
-    unit = wxyz_xyz[:, :4] / np.linalg.norm(wxyz_xyz[:, :4].astype(float), axis=1, keepdims=True)
-    return 2 * np.arccos(np.minimum(np.abs(np.sum(unit[:-1] * unit[1:], axis=1)), 1))
-
-
-def _looks(wxyz_xyz, body, step):
-    """Looks a segment so that no point of the body moves farther than step from one to the next: a power of 2, to compile few programs."""
-    shift = np.linalg.norm(np.diff(wxyz_xyz[:, 4:], axis=0), axis=1)
-    farthest = np.max(shift + _turns(wxyz_xyz) * np.linalg.norm(body, axis=1).max(), initial=0.0)
-    return int(min(2 ** np.ceil(np.log2(max(farthest / step, 1))), MOST_BETWEEN + 1))
-
-
-def _way(wxyz_xyz, body, lever):
-    """Length of the way to each pose, metres, turns counted by the lever."""
-    shift = np.linalg.norm(np.diff(_middles(wxyz_xyz, body), axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(shift + lever * _turns(wxyz_xyz))])
-
-
-def _measured(wxyz_xyz, body, groups, order, between):
-    """`Clearance`, and the distances at all looks and which point of the body is nearest, in the order of the groups."""
-    rows, nearest = map(np.asarray, _distances(groups, wxyz_xyz, body, looks=between + 1))
-    rows = rows.astype(float)
-    listed = np.empty_like(rows)
-    listed[:, order] = rows
-    windows = [listed[i : len(listed) - between - 1 + i : between + 1] for i in range(between + 2)]
-    return Clearance(listed[:: between + 1], np.min(windows, axis=0), between), rows, nearest
-
-
-def _apart_and_normals(groups, x):
-    """Signed distances (obstacles, ...) of points and their gradients, the obstacles in the order of the groups."""
-
-    def one(obstacle):
-        apart, pull = jax.vjp(obstacle.distance, x)
-        return apart, pull(jnp.ones_like(apart))[0]
-
-    found = [jax.vmap(one)(group) for group in groups]
-    return tuple(jnp.concatenate(parts) for parts in zip(*found))
-
-
-@functools.partial(jax.jit, static_argnames="looks")
-def _distances(groups, wxyz_xyz, body, *, looks):
-    R, t = se3.rotation(wxyz_xyz), se3.translation(wxyz_xyz)
-    fraction = jnp.arange(looks, dtype=t.dtype) / looks
-    turned = se3.geodesic(R[:-1, None], R[1:, None], fraction).reshape(-1, 3, 3)
-    shifted = (t[:-1, None] + fraction[:, None] * (t[1:] - t[:-1])[:, None]).reshape(-1, 3)
-
-    def least(pose):
-        x = se3.rotate(pose[0], body) + pose[1]
-        apart = jnp.concatenate([jax.vmap(lambda one: one.distance(x))(group) for group in groups])
-        return apart.min(axis=1), apart.argmin(axis=1)
-
-    all_R, all_t = jnp.concatenate([turned, R[-1:]]), jnp.concatenate([shifted, t[-1:]])
-    return jax.lax.map(least, (all_R, all_t))
-
-
 def _detours(wxyz_xyz, body, config):
     """Deviations to start from: none, and bumps of several heights to all sides of the chord; (starts, poses, 6)."""
-    places = _middles(wxyz_xyz, body)
+    places = body_centres(wxyz_xyz, body)
     R = np.asarray(se3.rotation(wxyz_xyz[0]), float)
     chord = places[-1] - places[0]
     length = np.linalg.norm(chord)
@@ -386,7 +255,7 @@ def _push(groups, wxyz_xyz, body, wanted, starts, numbers, iterations):
         between = se3.geodesic(R[:-1, None], R[1:, None], f)
         arms = se3.rotate(between, body)
         x = arms + (t[:-1, None] + f[:, None] * (t[1:] - t[:-1])[:, None])[:, :, None]
-        apart, normals = _apart_and_normals(groups, x)
+        apart, normals = distances_and_normals(groups, x)
         short = jnp.maximum(required - apart, 0)
         # A distance's slopes with respect to the shift and the turn of the frame at the look.
         rows = jnp.concatenate([normals, jnp.cross(jnp.broadcast_to(arms, normals.shape), normals)], axis=-1)

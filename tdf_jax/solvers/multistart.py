@@ -23,15 +23,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from tdf_jax.solvers import gauss_newton as descent
 from tdf_jax._internal import devices
-from tdf_jax.geometry import se3 as poses
-from tdf_jax.energy.reference import Reference
-from tdf_jax.energy.losses import EnergyWeights
-from tdf_jax._internal.errors import InputError
-from tdf_jax.networks.field import DescriptorField
 from tdf_jax._internal.checks import check_key
-from tdf_jax.solvers.adam import STARTS, Result, prepare
+from tdf_jax._internal.errors import InputError
+from tdf_jax.energy.losses import EnergyWeights
+from tdf_jax.energy.reference import Reference
+from tdf_jax.geometry import se3 as poses
+from tdf_jax.networks.field import DescriptorField
+from tdf_jax.solvers import gauss_newton as descent
+from tdf_jax.solvers.initial import STARTS, prepare
+from tdf_jax.solvers.result import Result
 
 # Points whose descriptors and 3 tangents exist at a time: 4 MB. With 500 query points a chunk of 512 took twice as long a point on a CPU with 2 MB of second-level cache a core.
 CHUNK_POINTS = 128

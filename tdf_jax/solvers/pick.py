@@ -13,16 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from tdf_jax.geometry import se3 as poses
-from tdf_jax.uncertainty.calibration import confidence, residual
-from tdf_jax.energy.reference import Reference
-from tdf_jax.energy.losses import EnergyWeights
-from tdf_jax._internal.errors import InputError
-from tdf_jax.networks.field import DescriptorField
 from tdf_jax._internal.checks import check_key
-from tdf_jax.solvers.adam import Result, check_goal, default_goal
-from tdf_jax.solvers.multistart import SolveConfig, solve
+from tdf_jax._internal.errors import InputError
+from tdf_jax.energy.losses import EnergyWeights
+from tdf_jax.energy.reference import Reference
+from tdf_jax.energy.residual import pick_residual
 from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.geometry.transport import carry_to_picks
+from tdf_jax.networks.field import DescriptorField
+from tdf_jax.solvers.initial import check_goal, default_goal
+from tdf_jax.solvers.multistart import SolveConfig, solve
+from tdf_jax.solvers.result import Result
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,39 +62,6 @@ class CarryConfig:
         scout, halve, refine, polish = self.steps
         settings = {name: getattr(self, name) for name in ("scouts", "finalists", "points", "tolerance", "start", "start_radius", "chunk")}
         return SolveConfig(inits=1, steps=(scout, halve, 1, 1, refine, polish), **settings)
-
-
-def carry_trajectory(demonstrated: Trajectory, pick: Float[Array, "7"], goal: Float[Array, "7"] | None) -> Trajectory:
-    """A demonstration carried by the motions of both of its ends.
-
-    With A the motion of the first pose to the pick and G that of the last pose to the goal, waypoint i of n is moved by B_i at
-    s = i / (n - 1): its rotation is the geodesic from A's to G's at s, and the waypoint is carried to the point at s on the line between where A and
-    where G would carry it. The first pose becomes the pick and the last the goal.
-
-    Args:
-        demonstrated: T_world_query, or in any other frame of the demonstration.
-        pick: first pose of the new trajectory, T_world_query, `wxyz_xyz`.
-        goal: its last pose; None carries all poses rigidly with the pick.
-
-    Returns:
-        The trajectory, T_world_query.
-
-    Raises:
-        InputError: the pick or the goal is not one pose.
-    """
-    for name, pose in (("pick", pick), ("goal", goal)):
-        if pose is not None and np.shape(pose) != (7,):
-            raise InputError(f"carry_trajectory(): {name} has shape {np.shape(pose)}; expected one pose wxyz_xyz, (7,)")
-    pick, goal = jnp.asarray(pick), None if goal is None else jnp.asarray(goal)
-    pick_motion = poses.compose(pick, poses.inverse(demonstrated.wxyz_xyz[0]))
-    if goal is None:
-        return demonstrated.transformed(pick_motion)
-    goal_motion = poses.compose(goal, poses.inverse(demonstrated.wxyz_xyz[-1]))
-    s = jnp.arange(demonstrated.poses) / max(1, demonstrated.poses - 1)
-    turn = poses.geodesic(poses.rotation(pick_motion), poses.rotation(goal_motion), s)
-    t = demonstrated.translations
-    carried = (1 - s)[:, None] * poses.transform(pick_motion, t) + s[:, None] * poses.transform(goal_motion, t)
-    return Trajectory(poses.pose(poses.multiply(turn, demonstrated.rotations), carried))
 
 
 def carry(
@@ -138,13 +106,5 @@ def carry(
     picked = Reference(reference.descriptors[:1], Trajectory(reference.trajectory.wxyz_xyz[:1]), reference.query)
     result = solve(field, picked, key, fix_last=False, energy=EnergyWeights(0.0), config=config.solver, progress=progress, mesh=mesh)
     trajectories, starts = (carry_to_picks(reference.trajectory, part[:, 0], goal) for part in (result.trajectories, result.starts))
-    left = residual(result.loss, picked.descriptors[0]) if result.finite.any() else float("nan")
-    return dataclasses.replace(result, trajectories=trajectories, starts=starts, residual=left, confidence=confidence(left))
-
-
-@jax.jit
-def carry_to_picks(
-    demonstrated: Trajectory, picks: Float[Array, "starts 7"], goal: Float[Array, "7"] | None
-) -> Float[Array, "starts poses 7"]:
-    """`carry_trajectory` from several picks."""
-    return jax.vmap(lambda pick: carry_trajectory(demonstrated, pick, goal).wxyz_xyz)(picks)
+    left = pick_residual(result.loss, picked.descriptors[0]) if result.finite.any() else float("nan")
+    return dataclasses.replace(result, trajectories=trajectories, starts=starts, residual=left)

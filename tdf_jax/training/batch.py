@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from tdf_jax.io.pointclouds import thin
+from tdf_jax.geometry.sampling import thin
 from tdf_jax.geometry.symmetry import about_z, nearest_turn
 from tdf_jax.training.dataset import DataSet
 from tdf_jax.training.labels import BOX_PADDING

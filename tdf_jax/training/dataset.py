@@ -17,9 +17,10 @@ from tqdm import tqdm
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
-from tdf_jax.io.meshes import MESH_SUFFIXES, file_axes, libigl
-from tdf_jax.shapes import FAMILIES
 from tdf_jax.geometry.symmetry import FOLDS
+from tdf_jax.geometry.winding import libigl
+from tdf_jax.io.meshes import MESH_SUFFIXES, file_axes
+from tdf_jax.shapes import FAMILIES
 from tdf_jax.training.labels import UNIFORM_SHARE, Labelled, canonical_mesh, generated_object, scanned_object
 
 MANIFEST = "dataset.json"

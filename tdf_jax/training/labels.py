@@ -8,9 +8,11 @@ from jaxtyping import Bool, Float, Int
 if TYPE_CHECKING:
     import trimesh
 
-from tdf_jax.geometry import views
 from tdf_jax._internal.errors import InputError
-from tdf_jax.io.meshes import file_axes, inside, load_mesh, sample_surface, winding_number
+from tdf_jax.geometry import views
+from tdf_jax.geometry.sampling import sample_surface
+from tdf_jax.geometry.winding import inside, winding_number
+from tdf_jax.io.meshes import file_axes, load_mesh
 from tdf_jax.shapes import FAMILIES
 
 UNIFORM_SHARE = 0.5  # of the query points: uniform in the padded bounding box; the rest lie near the surface

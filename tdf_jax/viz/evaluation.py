@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 
 from tdf_jax.evaluation.path_scores import MISSED, Score, by_method
 from tdf_jax.evaluation.path_tasks import Task
-from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, STYLE, TRUTH, blank_figure, legend_of
 from tdf_jax.viz.scene3d import WIDTH, View, bounds, panels, triangles_of
+from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, STYLE, TRUTH, blank_figure, legend_of
 
 LINES = ("-", "--", "-.", ":")
 FARTHEST = 20.0  # centimetres that errors are drawn to
@@ -59,7 +59,7 @@ def reliability_figure(scores: Sequence[Score], bins: Sequence[Mapping]) -> Figu
 
     Args:
         scores: those without a confidence are left out.
-        bins: of `tdf_jax.uncertainty.reliability.bins`.
+        bins: of `tdf_jax.uncertainty.calibration.bins`.
     """
     sure = [one for one in scores if one.confidence is not None]
     predicted, right = np.array([one.confidence for one in sure]), np.array([one.succeeds(*MISSED) for one in sure])

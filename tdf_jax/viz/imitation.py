@@ -8,10 +8,10 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from tdf_jax.energy.reference import Demonstration
+from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory
-from tdf_jax.viz.style import CLOUD, COLOURS, STYLE, blank_figure, legend_of
 from tdf_jax.viz.scene3d import View, bounds, content, draw, frame, triangles_of, waypoint_bar
+from tdf_jax.viz.style import CLOUD, COLOURS, STYLE, blank_figure, legend_of
 
 if TYPE_CHECKING:
     import trimesh

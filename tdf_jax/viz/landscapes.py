@@ -1,7 +1,6 @@
 """Pictures of energy landscapes: maps of planes, surfaces of equal energy in volumes, an animated slice, and a page to turn by hand."""
 
 import dataclasses
-import io
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,8 +13,8 @@ from matplotlib.figure import Figure
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
+from tdf_jax.geometry.winding import libigl
 from tdf_jax.landscape.storage import Landscape
-from tdf_jax.io.meshes import libigl
 from tdf_jax.viz import polygons3d as solid
 from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, LIGHT, STYLE, TRUTH, blank_figure, legend_of
 
@@ -64,7 +63,7 @@ def map_figure(landscape: Landscape, marks: Marks, title: str = "") -> Figure:
     Raises:
         InputError: the grid has one or three axes, or each rotation was kept.
     """
-    _check("map_figure", landscape, axes=2)
+    check_landscape("map_figure", landscape, axes=2)
     shown = np.unique(np.linspace(0, len(landscape.values) - 1, PANELS).round().astype(int))
     panels = {"all waypoints": landscape.combined} | {f"waypoint {index}": landscape.values[index] for index in shown}
     columns = min(COLUMNS, len(panels))
@@ -106,7 +105,7 @@ def isosurface_figure(landscape: Landscape, marks: Marks, title: str = "") -> Fi
     Raises:
         InputError: the grid has one or two axes, each rotation was kept, or libigl is not installed.
     """
-    _check("isosurface_figure", landscape, axes=3)
+    check_landscape("isosurface_figure", landscape, axes=3)
     with matplotlib.rc_context(STYLE):
         figure = blank_figure(6.5, 5.6)
         axes = figure.add_axes((0.0, 0.12, 1.0, 0.84), projection="3d")
@@ -121,7 +120,7 @@ def isosurface_figure(landscape: Landscape, marks: Marks, title: str = "") -> Fi
             pieces += solid.Pieces(list(triangles), [(*colour[:3], SEE_THROUGH)] * count, [(*colour[:3], 0.0)] * count)
             axes.plot([], [], [], color=colour, lw=6, alpha=2 * SEE_THROUGH, label=f"least {100 * share:.0f} % of the volume")
         axes.add_collection3d(pieces.collection())
-        for points, style in _paths(landscape, marks, CLOUD):
+        for points, style in path_lines(landscape, marks, CLOUD):
             axes.plot(*(CENTIMETRES * points.T), zorder=10, **style)
         corners = CENTIMETRES * landscape.grid.points[:: landscape.grid.shape[0] - 1, :: landscape.grid.shape[1] - 1, :: landscape.grid.shape[2] - 1]
         low, high = corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)
@@ -165,7 +164,7 @@ def save_slices(path: str | os.PathLike, landscape: Landscape, marks: Marks) -> 
     Raises:
         InputError: the grid has one or two axes, each rotation was kept, or the file cannot be written.
     """
-    _check("save_slices", landscape, axes=3)
+    check_landscape("save_slices", landscape, axes=3)
     grid, energy = landscape.grid, landscape.combined
     first, second, heights = (CENTIMETRES * steps for steps in grid.coordinates)
     local = CENTIMETRES * (marks.points - grid.origin) @ grid.directions.T
@@ -181,7 +180,7 @@ def save_slices(path: str | os.PathLike, landscape: Landscape, marks: Marks) -> 
             _map(axes, first, second, energy[:, :, index], low, high)
             near = np.abs(local[:, 2] - heights[index]) < NEAR * (heights[1] - heights[0])
             axes.scatter(*local[near, :2].T, s=3, color="white", linewidths=0)
-            for points, style in _paths(landscape, marks):
+            for points, style in path_lines(landscape, marks):
                 place = CENTIMETRES * (points - grid.origin) @ grid.directions.T
                 here = np.abs(place[:, 2] - heights[index]) < NEAR * (heights[1] - heights[0])
                 axes.plot(*place[here, :2].T, **(style | {"ls": "", "marker": style.get("marker", ".")}))
@@ -199,74 +198,7 @@ def save_slices(path: str | os.PathLike, landscape: Landscape, marks: Marks) -> 
             part.unlink(missing_ok=True)
 
 
-def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title: str = "") -> None:
-    """Write an .html page that opens without a network: a plane as a surface of energies, a volume as surfaces of equal energy, to turn, zoom
-    and read numbers from.
-
-    Args:
-        path: the file; it appears only once it is whole.
-        landscape: of a grid with two or three axes, in one orientation or the best of several.
-        marks: what to draw with it.
-        title: of the page.
-
-    Raises:
-        InputError: the grid has one axis, each rotation was kept, plotly (or, for a volume, libigl) is not installed, or the file cannot
-            be written.
-    """
-    plotly = pages("save_page()")
-    grid = landscape.grid
-    _check("save_page", landscape, axes=len(grid.shape) if len(grid.shape) > 1 else 2)
-    energy, points = landscape.combined, CENTIMETRES * grid.points
-    scale = {"colorscale": "Viridis", "colorbar": {"title": "energy"}}
-    if energy.ndim == 2:
-        x, y, z = np.moveaxis(points, -1, 0)
-        drawn = [plotly.Surface(x=x, y=y, z=z, surfacecolor=energy, opacity=0.85, name="energy", **scale)]
-    else:
-        drawn = []
-        # Surfaces of our own: plotly's know only grids along its axes.
-        for share, colour in zip(LEVELS, SURFACES):
-            x, y, z = CENTIMETRES * isosurface(landscape, share).reshape(-1, 3).T
-            i, j, k = np.arange(len(x)).reshape(-1, 3).T
-            name = f"energy {np.nanquantile(energy, share):.4f}: least {100 * share:.0f} %"
-            look = {"color": matplotlib.colors.to_hex(colour), "opacity": SEE_THROUGH, "name": name, "showlegend": True}
-            drawn.append(plotly.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, **look))
-    if marks.mesh is not None:
-        x, y, z = CENTIMETRES * np.asarray(marks.mesh.vertices).T
-        i, j, k = np.asarray(marks.mesh.faces).T
-        drawn.append(plotly.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, color=matplotlib.colors.to_hex(solid.CLAY), name="object", showlegend=True))
-    else:
-        x, y, z = CENTIMETRES * marks.points[:: max(1, len(marks.points) // SHOWN)].T
-        drawn.append(plotly.Scatter3d(x=x, y=y, z=z, mode="markers", marker={"size": 1.5, "color": CLOUD}, name="object"))
-    for line, style in _paths(landscape, marks, CLOUD):
-        x, y, z = CENTIMETRES * line.T
-        mode = "markers" if style.get("ls") == "" else "lines+markers"
-        look = {"line": {"color": style["color"], "width": 5}, "marker": {"size": 3, "color": style["color"]}}
-        drawn.append(plotly.Scatter3d(x=x, y=y, z=z, mode=mode, name=style["label"], **look))
-    figure = plotly.Figure(drawn)
-    ends = {f"{axis}axis": {"title": f"{axis} (cm)"} for axis in "xyz"}
-    azimuth, height = np.radians(ANGLES["azim"]), np.radians(ANGLES["elev"])
-    eye = 2.6 * np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
-    scene = ends | {"aspectmode": "data", "camera": {"eye": dict(zip("xyz", eye.tolist()))}}
-    figure.update_layout(title=title, scene=scene, legend={"x": 0, "y": 1}, margin={"l": 0, "r": 0, "b": 0, "t": 40})
-    page = io.StringIO()
-    figure.write_html(page, include_plotlyjs=True, full_html=True, default_height="95vh")
-    replace_file("save_page", Path(path), page.getvalue().encode())
-
-
-def pages(function: str):
-    """The plotly module that draws pages.
-
-    Raises:
-        InputError: it is not installed.
-    """
-    try:
-        import plotly.graph_objects
-    except ImportError:
-        raise InputError(f"{function}: plotly is not installed; expected it for pages: pip install 'tdf_jax[pages]'") from None
-    return plotly.graph_objects
-
-
-def _check(function, landscape, axes):
+def check_landscape(function, landscape, axes):
     if len(landscape.grid.shape) != axes:
         raise InputError(f"{function}(): the grid has {len(landscape.grid.shape)} axes; expected {axes}")
     if landscape.turned is None:
@@ -295,7 +227,7 @@ def _mark(axes, landscape, marks, chosen, whole):
     axes.scatter(*flat(near), s=0.8, color="white", alpha=0.7, linewidths=0)
     if whole:
         axes.plot([], [], ".", color="white", ms=3, label="object's points near the plane")
-        for points, style in _paths(landscape, marks)[:-1]:
+        for points, style in path_lines(landscape, marks)[:-1]:
             axes.plot(*flat(points), **({"lw": 1.0, "ms": 3, "mec": INK, "mew": 0.4} | style))
     axes.plot(*flat(landscape.minimisers[chosen]), **({"ms": 5, "mew": 1.3} | _MINIMISERS))
 
@@ -303,7 +235,7 @@ def _mark(axes, landscape, marks, chosen, whole):
 _MINIMISERS = {"ls": "", "marker": "x", "color": TRUTH, "label": "waypoints' minimisers"}
 
 
-def _paths(landscape, marks, colour="white"):
+def path_lines(landscape, marks, colour="white"):
     """Points and matplotlib's style of each path, the demonstration's in a colour; the minimisers last."""
     lines = [(landscape.waypoints, {"color": colour, "marker": "o", "mec": INK, "label": "demonstration, moved with the centroid"})]
     if marks.expected is not None:

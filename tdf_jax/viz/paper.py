@@ -7,7 +7,7 @@ from matplotlib.ticker import MaxNLocator, MultipleLocator
 
 from tdf_jax.evaluation.scene import Scene
 from tdf_jax.paper.figures import PAPER_DISTANCES, mean_over_seeds, turned
-from tdf_jax.paper.figure2 import Swept
+from tdf_jax.paper.energy_maps import Swept
 from tdf_jax.paper.runs import Run
 from tdf_jax.paper.table import vector
 from tdf_jax.geometry.trajectory import Trajectory

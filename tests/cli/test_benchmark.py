@@ -11,14 +11,14 @@ import matplotlib.figure
 import numpy as np
 import pytest
 
-from tdf_jax.uncertainty.reliability import bins
-from tdf_jax.evaluation.path_scores import Score, by_method
-from tdf_jax.evaluation.path_tasks import make_task, mesh_index
 from tdf_jax.cli.benchmark import Cloud
 from tdf_jax.cli.main import main
 from tdf_jax.evaluation.cases import mug_case
 from tdf_jax.evaluation.conditions import CONDITIONS
+from tdf_jax.evaluation.path_scores import Score, by_method
+from tdf_jax.evaluation.path_tasks import make_task, mesh_index
 from tdf_jax.shapes import build_mug
+from tdf_jax.uncertainty.calibration import bins
 from tdf_jax.viz.evaluation import demonstrations_figure, errors_figure, reliability_figure, truth_figure
 
 PNG = b"\x89PNG\r\n\x1a\n"

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 import tdf_jax as tdf
-from tdf_jax.networks.checkpoint import load_model, save_model
-from tdf_jax.cli import main as command_line, report, scene
+from tdf_jax.cli import imitate as report, main as command_line, options as scene
 from tdf_jax.cli.main import main
 from tdf_jax.cli.options import Settings
-from tdf_jax.evaluation.scene import PLACE
 from tdf_jax.evaluation.metrics import pose_error
+from tdf_jax.evaluation.scene import PLACE
 from tdf_jax.geometry.paths import PATHS
 from tdf_jax.io.demonstrations import save_demonstration
+from tdf_jax.networks.checkpoint import load_model, save_model
 from tdf_jax.shapes import build_mug
 
 QUICK = ("--method", "adam", "--inits", 2, "--iterations", 3, "--points", 60)
@@ -592,8 +592,8 @@ def test_a_model_card_tells_what_the_record_does(evaluation):
 
 def test_pictures_of_an_evaluation(weights, real, tmp_path, monkeypatch):
     drawn, triangle = [], np.array([[[0, 0, 0], [0.05, 0, 0], [0, 0.05, 0.01]]])
-    monkeypatch.setattr("tdf_jax.cli.pictures.reconstructed", lambda field, T, bounds: drawn.append(bounds) or triangle)
-    monkeypatch.setattr("tdf_jax.cli.pictures.MOST_GENERATED", 1)
+    monkeypatch.setattr("tdf_jax.networks.surface.reconstructed", lambda field, T, bounds: drawn.append(bounds) or triangle)
+    monkeypatch.setattr("tdf_jax.cli.evaluate.MOST_GENERATED", 1)
     run("evaluate", "--weights", weights, *EVALUATE, "--meshes", real, "--poses", 2, "--figures", tmp_path / "pictures")
     assert {path.name for path in (tmp_path / "pictures").iterdir()} == {"reconstructions.png", "transfers.png"}
     assert (tmp_path / "pictures" / "transfers.png").read_bytes().startswith(b"\x89PNG")

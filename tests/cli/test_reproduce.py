@@ -14,7 +14,7 @@ from tdf_jax.paper import figures
 from tdf_jax.viz import paper as pictures
 from tdf_jax.paper import setting as settings
 from tdf_jax.paper import table
-from tdf_jax.paper.figure2 import Swept
+from tdf_jax.paper.energy_maps import Swept
 from tdf_jax.paper.runs import Run
 from tdf_jax.paper.setting import Setting
 

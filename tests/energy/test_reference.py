@@ -9,7 +9,7 @@ from conftest import SMALL, random_cloud, random_poses
 
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
-from tdf_jax.io.pointclouds import thin
+from tdf_jax.geometry.sampling import thin
 
 
 @pytest.fixture(scope="module")

@@ -17,28 +17,27 @@ from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import binomtest
 
 import tdf_jax as tdf
-from tdf_jax.evaluation import demonstration_count as demonstrations
-from tdf_jax.evaluation import methods
-from tdf_jax.uncertainty import reliability
-from tdf_jax.evaluation import path_scores as scores
+from tdf_jax.energy.residual import pick_residual
+from tdf_jax._internal.errors import InputError
+from tdf_jax.energy.losses import EnergyWeights, trajectory_energy
+from tdf_jax.evaluation import demonstration_count as demonstrations, methods, path_scores as scores
+from tdf_jax.evaluation.annotated_meshes import AnnotatedMesh
+from tdf_jax.evaluation.cases import mug_case
 from tdf_jax.evaluation.demonstration_count import Learnt, learnt
 from tdf_jax.evaluation.methods import METHODS, Attempt, Attempts
+from tdf_jax.evaluation.metrics import pose_error
 from tdf_jax.evaluation.path_page import LISTED, markdown, page, record, sections
 from tdf_jax.evaluation.path_runs import run
 from tdf_jax.evaluation.path_scores import Score, by_method, interval, score, summarised
 from tdf_jax.evaluation.path_tasks import DISPLACEMENTS, carried_by, make_task, mesh_index
-from tdf_jax.energy.losses import EnergyWeights, trajectory_energy
-from tdf_jax._internal.errors import InputError
-from tdf_jax.evaluation.annotated_meshes import AnnotatedMesh
-from tdf_jax.evaluation.cases import mug_case
-from tdf_jax.evaluation.metrics import pose_error
-from tdf_jax.io.meshes import sample_surface
-from tdf_jax.networks.model import ModelInfo, encode
 from tdf_jax.geometry.paths import PATHS
-from tdf_jax.shapes import HANDLE_STYLES, MugParameters, build_mug, sample_mug, scaled
+from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.networks.encoding import encode
+from tdf_jax.networks.model import ModelInfo
+from tdf_jax.shapes import HANDLE_STYLES, MugParameters, build_mug, sample_mug, scaled
+from tdf_jax.uncertainty import calibration as sure
 
-sure = sys.modules["tdf_jax.uncertainty.calibration"]  # the package has a function of that name
 KEY = jax.random.key(5)
 SEED, INITS = 3, 2
 
@@ -705,24 +704,24 @@ def picks(number, truth):
 
 
 def test_calibrated_confidences_have_a_small_error_and_boasting_ones_a_large():
-    honest, boasting = (reliability.calibration_error(reliability.bins(*picks(8000, truth))) for truth in (lambda p: p, lambda p: 0.3 * p))
+    honest, boasting = (sure.calibration_error(sure.bins(*picks(8000, truth))) for truth in (lambda p: p, lambda p: 0.3 * p))
     assert honest < 0.02 and boasting == pytest.approx(0.7 * 0.5, abs=0.02)
 
 
 def test_the_error_weighs_bins_by_their_picks():
     rows = [{"picks": 3, "predicted": 0.5, "right": 0.4}, {"picks": 1, "predicted": 0.2, "right": 0.7}]
-    assert reliability.calibration_error(rows) == pytest.approx((3 * 0.1 + 0.5) / 4)
+    assert sure.calibration_error(rows) == pytest.approx((3 * 0.1 + 0.5) / 4)
 
 
 @pytest.mark.parametrize("number", [1, 5, 400])
 def test_bins_are_of_picks_between_edges_and_none_is_empty(number):
     """An edge begins the bin above it; the last has 1 too."""
-    edges = reliability.EDGES
+    edges = sure.EDGES
     assert (edges[0], edges[-1]) == (0, 1) and 0.25 in edges and list(edges) == sorted(edges)
     predicted, right = picks(number, lambda p: p)
     predicted = np.concatenate([predicted, [0.25, 1.0]])
     right = np.concatenate([right, [0.0, 1.0]])
-    rows = reliability.bins(predicted, right)
+    rows = sure.bins(predicted, right)
     assert sum(row["picks"] for row in rows) == len(predicted)
     chosen = [(predicted >= low) & ((predicted < high) | (high == 1)) for low, high in zip(edges, edges[1:])]
     for row, mine in zip(rows, [one for one in chosen if one.any()], strict=True):
@@ -738,9 +737,9 @@ def test_the_ranking_is_the_share_of_pairs_in_order():
     predicted, right = picks(60, lambda p: p)
     predicted = predicted.round(1)  # with ties
     counted = [1.0 if a > b else 0.5 if a == b else 0.0 for a, x in zip(predicted, right) for b, y in zip(predicted, right) if x > y]
-    assert reliability.ranking(predicted, right) == pytest.approx(sum(counted) / len(counted))
-    assert reliability.ranking(np.array([0.1, 0.2, 0.8]), np.array([0.0, 0.0, 1.0])) == 1.0
-    assert reliability.ranking(predicted, np.ones(60)) is None and reliability.ranking(predicted, np.zeros(60)) is None
+    assert sure.ranking(predicted, right) == pytest.approx(sum(counted) / len(counted))
+    assert sure.ranking(np.array([0.1, 0.2, 0.8]), np.array([0.0, 0.0, 1.0])) == 1.0
+    assert sure.ranking(predicted, np.ones(60)) is None and sure.ranking(predicted, np.zeros(60)) is None
 
 
 @pytest.mark.parametrize(("intercept", "slope"), [(-3.0, 2.5), (0.5, 1.0), (-6.0, 5.0)])
@@ -751,7 +750,7 @@ def test_the_fit_recovers_what_the_confidences_were_made_with(monkeypatch, inter
     residual = np.exp(rng.normal(-1.0, 0.6, 4000))
     right = (rng.uniform(size=4000) < [sure.confidence(one, intercept, slope) for one in residual]).astype(float)
     assert 200 < right.sum() < 3800
-    assert reliability.fit(residual, right) == pytest.approx((intercept, slope), abs=0.3 + 0.05 * slope)
+    assert sure.fit(residual, right) == pytest.approx((intercept, slope), abs=0.3 + 0.05 * slope)
 
 
 def test_the_fit_is_of_maximal_likelihood():
@@ -762,11 +761,11 @@ def test_the_fit_is_of_maximal_likelihood():
     def loss(w):
         return np.sum(np.logaddexp(0, np.where(right == 1, -1, 1) * (w[0] - w[1] * np.log(residual))))
 
-    assert reliability.fit(residual, right) == pytest.approx(minimize(loss, np.zeros(2)).x, rel=1e-3)
+    assert sure.fit(residual, right) == pytest.approx(minimize(loss, np.zeros(2)).x, rel=1e-3)
 
 
 def test_the_fit_stays_finite_where_right_and_wrong_do_not_overlap():
-    intercept, slope = reliability.fit(np.array([0.1, 0.11, 0.12, 0.4, 0.5, 0.6]), np.array([1.0, 1, 1, 0, 0, 0]))
+    intercept, slope = sure.fit(np.array([0.1, 0.11, 0.12, 0.4, 0.5, 0.6]), np.array([1.0, 1, 1, 0, 0, 0]))
     assert np.isfinite([intercept, slope]).all() and slope > 0
 
 
@@ -781,9 +780,9 @@ def test_the_residual_is_0_of_a_perfect_and_1_of_a_constant_match_in_any_unit():
     descriptors = np.random.default_rng(0).normal(3.0, 2.0, (8, 5)).astype(np.float32)
     constant = float(np.abs(descriptors - descriptors.sum(axis=0) / 8).mean())
     for unit in (1.0, 100.0):
-        assert sure.residual(0.0, unit * descriptors) == 0
-        assert sure.residual(unit * constant, unit * descriptors) == pytest.approx(1, rel=1e-5)
-        assert sure.residual(unit * constant / 4, jnp.asarray(unit * descriptors)) == pytest.approx(0.25, rel=1e-5)
+        assert pick_residual(0.0, unit * descriptors) == 0
+        assert pick_residual(unit * constant, unit * descriptors) == pytest.approx(1, rel=1e-5)
+        assert pick_residual(unit * constant / 4, jnp.asarray(unit * descriptors)) == pytest.approx(0.25, rel=1e-5)
 
 
 def test_the_residual_of_the_demonstrated_object_itself_is_0(model, task, values):
@@ -792,7 +791,7 @@ def test_the_residual_of_the_demonstrated_object_itself_is_0(model, task, values
     points = Rotation.from_quat(shown_in(task)[0, :4], scalar_first=True).apply(np.asarray(task.demonstration.query)) + shown_in(task)[0, 4:]
     descriptors, _ = values(field, jnp.asarray(points, jnp.float32))
     energy = float(np.mean(np.abs(np.asarray(descriptors) - reference.descriptors[0])))
-    assert sure.residual(energy, reference.descriptors[0]) < 1e-2
+    assert pick_residual(energy, reference.descriptors[0]) < 1e-2
 
 
 def test_confidence_falls_as_the_match_gets_worse_and_is_a_probability():
@@ -806,7 +805,7 @@ def test_confidence_falls_as_the_match_gets_worse_and_is_a_probability():
 
 def test_confidence_is_none_where_there_is_no_residual():
     assert sure.confidence(float("nan")) is None and sure.confidence(float("inf")) is None
-    assert np.isnan(sure.residual(0.5, np.ones((1, 5))))  # one query point
+    assert np.isnan(pick_residual(0.5, np.ones((1, 5))))  # one query point
 
 
 # ---- what is kept ----

@@ -2,25 +2,23 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import compilations
 from scipy.spatial import cKDTree
 
 import tdf_jax as tdf
-from tdf_jax.geometry import se3 as poses
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.annotated_meshes import AnnotatedMesh
 from tdf_jax.evaluation.cases import mesh_case, mug_case
-from tdf_jax.evaluation.conditions import CONDITIONS, NOISE
 from tdf_jax.evaluation.comparison import BASELINES, compare, random_weights
-from tdf_jax.evaluation.statistics import summary
-from tdf_jax.evaluation.pick_transfer import QUERY_SIZE, overlaps, place_errors, transferred
+from tdf_jax.evaluation.conditions import CONDITIONS, NOISE
 from tdf_jax.evaluation.metrics import expected_trajectory, path_error, pose_error
-from tdf_jax.io.meshes import sample_surface
-
-from conftest import compilations
+from tdf_jax.evaluation.pick_transfer import QUERY_SIZE, overlaps, place_errors, transferred
+from tdf_jax.evaluation.statistics import summary
+from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry.sampling import sample_surface
 
 
 def rigid(rotation_vector, translation):

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.paths import line, wave
-from tdf_jax.geometry.trajectory import Trajectory, check_trajectory, displace, load_trajectory, resample, save_trajectory
+from tdf_jax.geometry.trajectory import Trajectory, check_trajectory, displace, resample
+from tdf_jax.io.trajectories import load_trajectory, save_trajectory
 
 IDENTITY = np.array([1, 0, 0, 0, 0, 0, 0], np.float32)
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from tdf_jax.geometry import views
 from tdf_jax._internal.errors import InputError
-from tdf_jax.io.meshes import sample_surface
-from tdf_jax.shapes import build_mug, sample_mug
+from tdf_jax.geometry import views
+from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.geometry.views import merge_views, single_view
+from tdf_jax.shapes import build_mug, sample_mug
 
 
 def truly_visible(mug, points, direction):

@@ -8,7 +8,9 @@ import trimesh
 from scipy.stats import kstest
 
 from tdf_jax._internal.errors import InputError
-from tdf_jax.io.meshes import AXES, file_axes, inside, sample_surface, winding_number
+from tdf_jax.geometry.sampling import sample_surface
+from tdf_jax.geometry.winding import inside, winding_number
+from tdf_jax.io.meshes import AXES, file_axes
 from tdf_jax.shapes import build_mug, sample_mug
 
 

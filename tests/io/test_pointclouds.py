@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from tdf_jax._internal.checks import check_points
 from tdf_jax._internal.errors import InputError
+from tdf_jax.geometry.sampling import thin, thin_indices
 from tdf_jax.io.meshes import load_mesh
-from tdf_jax.io.pointclouds import check_points, load_points, thin, thin_indices
+from tdf_jax.io.pointclouds import load_points
 
 CLOUD = np.random.default_rng(0).normal(size=(40, 3)).astype(np.float32)
 SUFFIXES = ["obj", "stl", "ply", "glb", "off"]

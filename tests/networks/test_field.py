@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
-from tdf_jax.networks.model import agreeing
+from tdf_jax.geometry.sampling import thinnings
+from tdf_jax.networks.encoding import agreeing
 from tdf_jax.networks.occupancy import encode_latent
-from tdf_jax.io.pointclouds import thinnings
 
 # float32 coordinates half a metre away carry 3e-8 m, of offsets of 5 cm; the network's own rounding is 1e-5.
 EQUIVARIANCE = {"float32": 2e-4, "float64": 1e-10}

@@ -11,8 +11,9 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from scipy.spatial import cKDTree
 
 import tdf_jax as tdf
-from tdf_jax.networks import occupancy as network
-from tdf_jax.networks.occupancy import EdgeConvolution, condition, decode, nearest_neighbours
+from tdf_jax.networks import occupancy as network, vector_neurons
+from tdf_jax.networks.occupancy import condition, decode
+from tdf_jax.networks.vector_neurons import EdgeConvolution, nearest_neighbours
 
 ENCODER_STAGES = {"conv_pos": "conv_pos_pooled", "fc_pos": "fc_pos", "actvn_c": "actvn_c", "fc_c": "fc_c"}
 ENCODER_STAGES |= {f"block_{index}": f"block_{index}" for index in range(5)}
@@ -132,7 +133,7 @@ def test_the_edge_convolution_and_its_gradient_are_those_of_the_plain_form(quick
             assert relative_error(a, b) < 1e-10
 
 
-@pytest.mark.parametrize("count", [21, network.NEIGHBOUR_ROWS + 7])  # within a block of rows, and over its edge
+@pytest.mark.parametrize("count", [21, vector_neurons.NEIGHBOUR_ROWS + 7])  # within a block of rows, and over its edge
 def test_nearest_neighbours(count):
     points = np.random.default_rng(0).normal(size=(count, 3)).astype(np.float32)
     found = np.sort(nearest_neighbours(jnp.asarray(points), 20), axis=1)

@@ -8,9 +8,10 @@ import pytest
 from conftest import carried, composed, random_poses
 
 import tdf_jax as tdf
-from tdf_jax.planning.avoidance import Clearance, ClearanceConfig, clearance, push_clear
 from tdf_jax._internal.errors import InputError
-from tdf_jax.planning.obstacles import DistanceGrid, box_obstacle
+from tdf_jax.geometry.distance_fields import DistanceGrid, box_obstacle
+from tdf_jax.planning.avoidance import ClearanceConfig, push_clear
+from tdf_jax.planning.distances import Clearance, clearance
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 # A cube of 4 cm that is off the frame's origin, by its corners and its centre.

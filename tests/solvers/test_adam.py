@@ -11,12 +11,13 @@ from flax.traverse_util import unflatten_dict
 from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
-from tdf_jax.geometry import se3 as poses
-from tdf_jax.energy.reference import Reference
 from tdf_jax._internal.errors import InputError
+from tdf_jax.energy.reference import Reference
+from tdf_jax.geometry import se3 as poses
 from tdf_jax.networks.field import DescriptorField
 from tdf_jax.networks.occupancy import condition, parameter_shapes
-from tdf_jax.solvers.adam import _begin, _run, default_goal, random_starts
+from tdf_jax.solvers.adam import _begin, _run
+from tdf_jax.solvers.initial import default_goal, random_starts
 
 CONFIG = tdf.OptimizeConfig(inits=3, iterations=5)
 WEIGHTS = tdf.EnergyWeights(correlation=0.3, compensator=0.1, lever=0.2)

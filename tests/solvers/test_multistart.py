@@ -11,11 +11,11 @@ from conftest import carried, compilations, composed, random_cloud, random_poses
 from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
-from tdf_jax.solvers import gauss_newton as descent
-from tdf_jax.geometry import se3 as poses
-from tdf_jax.energy.losses import pose_energy, waypoint_loss
 from tdf_jax._internal.errors import InputError
-from tdf_jax.solvers.adam import default_goal, random_starts
+from tdf_jax.energy.losses import pose_energy, waypoint_loss
+from tdf_jax.geometry import se3 as poses
+from tdf_jax.solvers import gauss_newton as descent
+from tdf_jax.solvers.initial import default_goal, random_starts
 from tdf_jax.solvers.multistart import Candidates, SolveConfig
 
 solve = sys.modules["tdf_jax.solvers.multistart"]  # `tdf_jax.solve` is the function

@@ -10,10 +10,9 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from tdf_jax._internal.errors import InputError
-from tdf_jax.io.meshes import sample_surface
+from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.shapes import FAMILIES, build_mug, sample_mug
 from tdf_jax.training import dataset
-from tdf_jax.training import labels as objects
 from tdf_jax.training.dataset import DataSet, Recipe, build, joined, load
 from tdf_jax.training.labels import BOX_PADDING, canonical_mesh, generated_object, scanned_object
 

@@ -10,11 +10,12 @@ from conftest import carried, compilations, composed, random_cloud, random_poses
 from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
-from tdf_jax.uncertainty import modes
-from tdf_jax.geometry import se3 as poses
-from tdf_jax.energy.losses import waypoint_loss
 from tdf_jax._internal.errors import InputError
-from tdf_jax.uncertainty.modes import cluster_poses, pose_covariance
+from tdf_jax.energy.losses import waypoint_loss
+from tdf_jax.geometry import se3 as poses
+from tdf_jax.uncertainty import covariance as covariance_module
+from tdf_jax.uncertainty.covariance import pose_covariance
+from tdf_jax.uncertainty.modes import cluster_poses
 
 BOUNDS = {"angle": np.radians(10), "distance": 0.01}
 
@@ -207,7 +208,7 @@ def test_where_the_energy_falls_the_curvature_is_negative_and_the_direction_coun
 )
 def test_a_twist_is_a_motion_about_an_axis(twist, direction, point, pitch):
     centre = np.array([0.1, 0.3, 0.1])
-    screw = modes._screw(np.array(twist, float), centre, 0.03)
+    screw = covariance._screw(np.array(twist, float), centre, 0.03)
     np.testing.assert_allclose(screw.direction, direction, atol=1e-12)
     np.testing.assert_allclose(screw.point, point, atol=1e-12)
     assert screw.pitch == pytest.approx(pitch)
@@ -222,7 +223,7 @@ def test_twists_are_turns_about_their_axis_at_any_angle():
     axis *= 2.5 / np.linalg.norm(axis)
     for share in (1e-6, 0.01, 1.0):
         turn = share * axis
-        R, moved = modes._screwed(jnp.eye(3), jnp.asarray(turn, jnp.float32), jnp.asarray(np.cross(turn, centre - point), jnp.float32))
+        R, moved = covariance._screwed(jnp.eye(3), jnp.asarray(turn, jnp.float32), jnp.asarray(np.cross(turn, centre - point), jnp.float32))
         expected = Rotation.from_rotvec(turn)
         np.testing.assert_allclose(R, expected.as_matrix(), atol=1e-6)
         np.testing.assert_allclose(moved, expected.apply(centre - point) + point - centre, atol=2e-6)
@@ -368,7 +369,7 @@ def at(*place):
 @pytest.mark.parametrize("place", [at(-0.04, 0, 0.05), at(0.06, 0, 0), at(0, 0, 0.05)], ids=["rim", "side", "axis"])
 def test_a_cup_without_handle_is_free_to_turn_about_its_axis(mug_model, query, place, quick_compilation):
     found = transferred(mug_model, query, cup(0, 0.040, 0.045), cup(1, 0.038, 0.043), place)
-    assert found.values[0] < 0.005 * found.values[-1] and found.values[1] > 2 * modes.FREE * found.values[-1]
+    assert found.values[0] < 0.005 * found.values[-1] and found.values[1] > 2 * covariance_module.FREE * found.values[-1]
     (screw,) = found.screws
     turn = Rotation.from_quat(T_WORLD_OBJECT[:4], scalar_first=True)
     direction, point = turn.inv().apply(screw.direction), turn.inv().apply(screw.point - T_WORLD_OBJECT[4:])
@@ -380,7 +381,7 @@ def test_a_mug_with_a_handle_is_not(mug_model, query, quick_compilation):
     a, b = tdf.build_mug(), tdf.build_mug(tdf.sample_mug(np.random.default_rng(77)))
     clouds = (np.asarray(tdf.sample_surface(one.mesh, 1500, 0)) for one in (a, b))
     found = transferred(mug_model, query, *clouds, a.handle_frame)
-    assert len(found.free) == 0 and found.values[0] > 1.5 * modes.FREE * found.values[-1]
+    assert len(found.free) == 0 and found.values[0] > 1.5 * covariance_module.FREE * found.values[-1]
     turn = Rotation.from_quat(T_WORLD_OBJECT[:4], scalar_first=True)
     assert np.linalg.norm(found.centre - carried(T_WORLD_OBJECT, b.handle_frame[:3, 3])) < 0.015  # the handle it is
     sigma = np.sqrt(np.diagonal(found.covariance))

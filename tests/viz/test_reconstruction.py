@@ -10,9 +10,10 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from tdf_jax._internal.errors import InputError
+from tdf_jax.networks import surface
+from tdf_jax.networks.surface import reconstructed
 from tdf_jax.viz import reconstruction
-from tdf_jax.viz.reconstruction import Panel, reconstructed, reconstruction_figure, transfer_figure
+from tdf_jax.viz.reconstruction import Panel, reconstruction_figure, transfer_figure
 
 
 @functools.partial(jax.tree_util.register_dataclass, data_fields=["middle"], meta_fields=[])
@@ -34,7 +35,7 @@ BOUNDS = np.array([[-0.05, -0.03, -0.02], [0.05, 0.03, 0.02]])
 @pytest.fixture
 def coarse(monkeypatch):
     """Few cells and pieces: the same programs, quicker."""
-    monkeypatch.setattr(reconstruction, "CELLS", 30)
+    monkeypatch.setattr(surface, "CELLS", 30)
     monkeypatch.setattr(reconstruction, "PIECES", 4)
 
 

@@ -15,21 +15,15 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from tdf_jax.geometry import se3
+from tdf_jax._internal.checks import check_points, check_rotations, checked_vector
 from tdf_jax._internal.errors import InputError
-from tdf_jax.networks.field import DescriptorField
-from tdf_jax.io.meshes import libigl, winding_number
-from tdf_jax.io.pointclouds import check_points
-from tdf_jax.geometry.trajectory import check_rotations, checked_vector
+from tdf_jax.geometry import se3
+from tdf_jax.geometry.winding import libigl, winding_number
 
 if TYPE_CHECKING:
     import trimesh
 
 MOST_NODES = 4_000_000  # of a grid: 16 MB of float32, and a minute or less of distances
-FIELD_BLOCK = 8192  # points of a field evaluated in one call: one size, so that objects of all sizes run one program
-# Occupancies are asked within this of the cloud's bounding box, metres: farther away the network knows no shapes, and of four mugs
-# sampled to 0.2 m about them all had solid blobs in the air. Pieces of surface farther than this from all points are left out as well.
-FIELD_REACH = 0.015
 
 
 @jax.tree_util.register_dataclass
@@ -164,7 +158,7 @@ def mesh_obstacle(mesh: "trimesh.Trimesh", pitch: float = 0.01, pad: float = 0.0
         distance = np.sqrt(igl.point_mesh_squared_distance(x, vertices, faces)[0])
         return np.where(np.abs(winding_number(mesh, x)) > 0.5, -distance, distance)
 
-    return _tabulated("mesh_obstacle", vertices[faces].reshape(-1, 3), pitch, pad, signed)
+    return tabulated("mesh_obstacle", vertices[faces].reshape(-1, 3), pitch, pad, signed)
 
 
 def cloud_obstacle(points: Float[Array, "points 3"], radius: float = 0.005, pitch: float = 0.005, pad: float = 0.05) -> DistanceGrid:
@@ -191,85 +185,16 @@ def cloud_obstacle(points: Float[Array, "points 3"], radius: float = 0.005, pitc
     if not (np.ndim(radius) == 0 and 0 <= radius < np.inf):
         raise InputError(f"cloud_obstacle(): radius is {radius}; expected a length of 0 or more, metres")
     tree = cKDTree(points)
-    return _tabulated("cloud_obstacle", points, pitch, pad, lambda x: tree.query(x)[0] - radius)
+    return tabulated("cloud_obstacle", points, pitch, pad, lambda x: tree.query(x)[0] - radius)
 
 
-def field_obstacle(field: DescriptorField, points: Float[Array, "points 3"], pitch: float = 0.003, pad: float = 0.03) -> DistanceGrid:
-    """The object itself to keep clear of, as its field knows it: the surface is where the occupancy is a half.
-
-    The field tells hidden sides too, which the cloud does not. Refine it first (`refine`): this is what that is for. How far from true the distances
-    are, docs/clearance.md tells.
-
-    Args:
-        field: The object's.
-        points: Its cloud, metres, world frame; it tells where to look for surface: up to 15 mm away from its bounding box.
-        pitch: Of the grid, metres; half of a wall's thickness or less, or the wall is lost in places.
-        pad: How far the grid reaches beyond the points, metres; more than the margin that is kept.
-
-    Returns:
-        The obstacle.
-
-    Raises:
-        InputError: The points are not a cloud, pitch or pad is not above 0, the grid has more than 4 million nodes, or the field has no surface within
-            15 mm of the points.
-    """
-    from scipy.ndimage import label
-    from scipy.spatial import cKDTree
-
-    points = np.asarray(check_points(points), float)
-    _check_lengths("field_obstacle", pitch, pad)
-    x = _nodes("field_obstacle", points, pitch, FIELD_REACH + pitch)
-    flat = np.asarray(x.reshape(-1, 3), field.origin.dtype)
-    blocks = [flat[i : i + FIELD_BLOCK] for i in range(0, len(flat), FIELD_BLOCK)]
-    blocks = [_excess(field, np.resize(block, (FIELD_BLOCK, 3)))[: len(block)] for block in blocks]
-    excess = np.concatenate(blocks).reshape(x.shape[:3]).astype(float)
-    # Solid at the border of what was asked would be cut open there.
-    border = np.ones(excess.shape, bool)
-    border[1:-1, 1:-1, 1:-1] = False
-    excess[border] = np.minimum(excess[border], -1e-3)
-    pieces, count = label(excess > 0, np.ones((3, 3, 3)))
-    near = cKDTree(points).query(x[pieces > 0])[0] < FIELD_REACH
-    kept = np.isin(pieces, np.unique(pieces[pieces > 0][near]))
-    if not kept.any():
-        raise InputError(
-            f"field_obstacle(): of {count} solid pieces none lies within {FIELD_REACH} m of the points; expected the object's surface there; "
-            "give the cloud that was encoded, or refine the field"
-        )
-    excess = np.where((pieces > 0) & ~kept, -1e-3, excess)
-    surface = []
-    for axis in range(3):
-        values, places = np.moveaxis(excess, axis, 0), np.moveaxis(x, axis, 0)
-        crosses = (values[1:] > 0) != (values[:-1] > 0)
-        part = (values[:-1] / np.where(crosses, values[:-1] - values[1:], 1))[crosses][:, None]
-        surface.append(places[:-1][crosses] * (1 - part) + places[1:][crosses] * part)
-    tree = cKDTree(np.concatenate(surface))
-
-    def signed(nodes):
-        away = tree.query(nodes)[0]
-        place = np.round((nodes - x[0, 0, 0]) / pitch).astype(int)
-        known = ((place >= 0) & (place < excess.shape)).all(axis=-1)
-        inside = known & (excess[tuple(np.where(known[:, None], place, 0).T)] > 0)
-        return np.where(inside, -away, away)
-
-    # The same nodes and some around them: their signs are those of the occupancies.
-    around = pitch * max(int(np.ceil((pad - FIELD_REACH - pitch) / pitch)), 0)
-    return _tabulated("field_obstacle", x[[0, -1], [0, -1], [0, -1]], pitch, max(around, 1e-9), signed)
-
-
-@jax.jit
-def _excess(field, x):
-    """Log odds of the occupancy: nearer to linear across the surface than the occupancy is."""
-    occupancy = jnp.clip(field.occupancy(x), 1e-6, 1 - 1e-6)
-    return jnp.log(occupancy / (1 - occupancy))
-
-
-def _check_lengths(function: str, pitch: float, pad: float) -> None:
+def check_lengths(function: str, pitch: float, pad: float) -> None:
     for name, value in (("pitch", pitch), ("pad", pad)):
         if not (np.ndim(value) == 0 and 0 < value < np.inf):
             raise InputError(f"{function}(): {name} is {value}; expected a length above 0, metres")
 
 
-def _nodes(function: str, points: np.ndarray, pitch: float, pad: float) -> Float[np.ndarray, "x y z 3"]:
+def grid_nodes(function: str, points: np.ndarray, pitch: float, pad: float) -> Float[np.ndarray, "x y z 3"]:
     low, high = points.min(axis=0) - pad, points.max(axis=0) + pad
     counts = np.ceil((high - low) / pitch - 1e-6).astype(int) + 1
     if np.prod(counts, dtype=float) > MOST_NODES:
@@ -280,8 +205,8 @@ def _nodes(function: str, points: np.ndarray, pitch: float, pad: float) -> Float
     return np.stack(np.meshgrid(*(low[i] + pitch * np.arange(counts[i]) for i in range(3)), indexing="ij"), axis=-1)
 
 
-def _tabulated(function: str, points: np.ndarray, pitch: float, pad: float, signed: Callable[[np.ndarray], np.ndarray]) -> DistanceGrid:
-    _check_lengths(function, pitch, pad)
-    x = _nodes(function, points, pitch, pad)
+def tabulated(function: str, points: np.ndarray, pitch: float, pad: float, signed: Callable[[np.ndarray], np.ndarray]) -> DistanceGrid:
+    check_lengths(function, pitch, pad)
+    x = grid_nodes(function, points, pitch, pad)
     values = signed(x.reshape(-1, 3)).reshape(x.shape[:3])
     return DistanceGrid(jnp.asarray(x[0, 0, 0]), jnp.asarray(pitch, float), jnp.asarray(values))

@@ -8,10 +8,11 @@ import trimesh
 from conftest import carried, enabled, random_cloud, random_poses
 
 import tdf_jax as tdf
-from tdf_jax.geometry import se3
-from tdf_jax.planning import obstacles
 from tdf_jax._internal.errors import InputError
-from tdf_jax.planning.obstacles import DistanceGrid, box_obstacle, cloud_obstacle, field_obstacle, mesh_obstacle
+from tdf_jax.geometry import distance_fields as obstacles, se3
+from tdf_jax.geometry.distance_fields import DistanceGrid, box_obstacle, cloud_obstacle, mesh_obstacle
+from tdf_jax.planning import occupied
+from tdf_jax.planning.occupied import field_obstacle
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 SIZE = np.array([0.1, 0.2, 0.04])
@@ -152,7 +153,7 @@ def test_distances_to_a_field_are_those_to_the_mug(mug):
 
 def test_a_field_without_a_surface_near_the_points_is_refused(mug, monkeypatch):
     _, _, points, field = mug
-    monkeypatch.setattr(obstacles, "_excess", lambda field, x: 0.005 - jnp.linalg.norm(x - points.mean(axis=0), axis=-1))  # a pea in the hollow
+    monkeypatch.setattr(occupied, "_excess", lambda field, x: 0.005 - jnp.linalg.norm(x - points.mean(axis=0), axis=-1))  # a pea in the hollow
     with pytest.raises(InputError, match=r"field_obstacle\(\): of \d+ solid pieces none lies within 0.015 m"):
         field_obstacle(field, points, pitch=0.005)
 

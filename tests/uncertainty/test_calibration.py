@@ -9,10 +9,10 @@ import pytest
 from conftest import random_cloud
 
 import tdf_jax as tdf
-from tdf_jax.uncertainty.reliability import logistic
 from tdf_jax.evaluation.cases import generated_case
-from tdf_jax.evaluation.scene import place_demonstration
 from tdf_jax.evaluation.pick_transfer import QUERY_SIZE
+from tdf_jax.evaluation.scene import place_demonstration
+from tdf_jax.uncertainty.calibration import logistic
 
 KEY = jax.random.key(0)
 CURVE = (-1.0, 2.0, 3.0)

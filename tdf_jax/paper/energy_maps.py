@@ -8,12 +8,13 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from tdf_jax.energy.reference import Reference, describe
+from tdf_jax.geometry.grid import plane_grid
+from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.landscape.energy_grid import energy_landscape
+from tdf_jax.networks.encoding import encode
+from tdf_jax.networks.model import Model
 from tdf_jax.paper import setting as settings
 from tdf_jax.paper.setting import SHAPES, Setting
-from tdf_jax.geometry.grid import plane_grid
-from tdf_jax.networks.model import Model, encode
-from tdf_jax.landscape.energy_grid import energy_landscape
-from tdf_jax.geometry.trajectory import Trajectory
 
 HALF = 1.2  # of the square's side, in the paper's unit
 UPRIGHT_TURN = 60.0  # degrees about z of the turned mugs, whose true paths so stay in the plane; `Setting.turn` if it is a number

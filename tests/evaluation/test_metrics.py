@@ -7,7 +7,7 @@ import pytest
 
 import tdf_jax as tdf
 from tdf_jax.evaluation.cases import random_pose
-from tdf_jax.evaluation.motion import frechet_distance, jerk, longest_step, penetration
+from tdf_jax.evaluation.metrics import frechet_distance, jerk, longest_step, penetration
 
 
 def test_the_frechet_distance_is_the_least_longest_leash():

@@ -1,0 +1,36 @@
+"""A demonstration: one trajectory shown on one object."""
+
+import dataclasses
+
+from jaxtyping import Array, Float
+
+from tdf_jax._internal.checks import check_points, check_query
+from tdf_jax._internal.errors import InputError
+from tdf_jax.geometry.trajectory import Trajectory, check_trajectory
+
+
+@dataclasses.dataclass(frozen=True)
+class Demonstration:
+    """One trajectory shown on one object.
+
+    Attributes:
+        points: the object's cloud, (points, 3), metres, world frame.
+        trajectory: poses of the query frame from the pick (index 0) to the place (last).
+        query: query points in the query frame, (queries, 3), metres.
+
+    Raises:
+        InputError: bad points, or query points that are not (queries, 3) and finite.
+    """
+
+    points: Float[Array, "points 3"]
+    trajectory: Trajectory
+    query: Float[Array, "queries 3"]
+
+    def __post_init__(self):
+        check_points(self.points, "the demonstration's points")
+        if not isinstance(self.trajectory, Trajectory):
+            raise InputError(
+                f"Demonstration(): trajectory is a {type(self.trajectory).__name__}; expected a Trajectory, such as tdf.wave()"
+            )
+        check_trajectory(self.trajectory)
+        check_query("Demonstration()", self.query)

@@ -1,0 +1,86 @@
+"""Pages that open in a browser."""
+
+import io
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import matplotlib
+import numpy as np
+
+from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.files import replace_file
+from tdf_jax.landscape.storage import Landscape
+from tdf_jax.viz import polygons3d as solid
+from tdf_jax.viz.landscapes import ANGLES, LEVELS, SEE_THROUGH, SHOWN, SURFACES, Marks, check_landscape, path_lines, isosurface
+from tdf_jax.viz.style import CENTIMETRES, CLOUD
+
+if TYPE_CHECKING:
+    pass
+
+
+def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title: str = "") -> None:
+    """Write an .html page that opens without a network: a plane as a surface of energies, a volume as surfaces of equal energy, to turn, zoom
+    and read numbers from.
+
+    Args:
+        path: the file; it appears only once it is whole.
+        landscape: of a grid with two or three axes, in one orientation or the best of several.
+        marks: what to draw with it.
+        title: of the page.
+
+    Raises:
+        InputError: the grid has one axis, each rotation was kept, plotly (or, for a volume, libigl) is not installed, or the file cannot
+            be written.
+    """
+    plotly = pages("save_page()")
+    grid = landscape.grid
+    check_landscape("save_page", landscape, axes=len(grid.shape) if len(grid.shape) > 1 else 2)
+    energy, points = landscape.combined, CENTIMETRES * grid.points
+    scale = {"colorscale": "Viridis", "colorbar": {"title": "energy"}}
+    if energy.ndim == 2:
+        x, y, z = np.moveaxis(points, -1, 0)
+        drawn = [plotly.Surface(x=x, y=y, z=z, surfacecolor=energy, opacity=0.85, name="energy", **scale)]
+    else:
+        drawn = []
+        # Surfaces of our own: plotly's know only grids along its axes.
+        for share, colour in zip(LEVELS, SURFACES):
+            x, y, z = CENTIMETRES * isosurface(landscape, share).reshape(-1, 3).T
+            i, j, k = np.arange(len(x)).reshape(-1, 3).T
+            name = f"energy {np.nanquantile(energy, share):.4f}: least {100 * share:.0f} %"
+            look = {"color": matplotlib.colors.to_hex(colour), "opacity": SEE_THROUGH, "name": name, "showlegend": True}
+            drawn.append(plotly.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, **look))
+    if marks.mesh is not None:
+        x, y, z = CENTIMETRES * np.asarray(marks.mesh.vertices).T
+        i, j, k = np.asarray(marks.mesh.faces).T
+        drawn.append(plotly.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, color=matplotlib.colors.to_hex(solid.CLAY), name="object", showlegend=True))
+    else:
+        x, y, z = CENTIMETRES * marks.points[:: max(1, len(marks.points) // SHOWN)].T
+        drawn.append(plotly.Scatter3d(x=x, y=y, z=z, mode="markers", marker={"size": 1.5, "color": CLOUD}, name="object"))
+    for line, style in path_lines(landscape, marks, CLOUD):
+        x, y, z = CENTIMETRES * line.T
+        mode = "markers" if style.get("ls") == "" else "lines+markers"
+        look = {"line": {"color": style["color"], "width": 5}, "marker": {"size": 3, "color": style["color"]}}
+        drawn.append(plotly.Scatter3d(x=x, y=y, z=z, mode=mode, name=style["label"], **look))
+    figure = plotly.Figure(drawn)
+    ends = {f"{axis}axis": {"title": f"{axis} (cm)"} for axis in "xyz"}
+    azimuth, height = np.radians(ANGLES["azim"]), np.radians(ANGLES["elev"])
+    eye = 2.6 * np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
+    scene = ends | {"aspectmode": "data", "camera": {"eye": dict(zip("xyz", eye.tolist()))}}
+    figure.update_layout(title=title, scene=scene, legend={"x": 0, "y": 1}, margin={"l": 0, "r": 0, "b": 0, "t": 40})
+    page = io.StringIO()
+    figure.write_html(page, include_plotlyjs=True, full_html=True, default_height="95vh")
+    replace_file("save_page", Path(path), page.getvalue().encode())
+
+
+def pages(function: str):
+    """The plotly module that draws pages.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        import plotly.graph_objects
+    except ImportError:
+        raise InputError(f"{function}: plotly is not installed; expected it for pages: pip install 'tdf_jax[pages]'") from None
+    return plotly.graph_objects
