@@ -21,7 +21,7 @@ from bench.machine import machine
 from bench.measure import matmul_gflops, measure
 from bench.parity import parity
 from bench.rows import QUICK, Sizes, rows, select
-from bench.workers import Workers, WorkerError
+from bench.workers import WorkerError, Workers
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
 

@@ -18,8 +18,8 @@ import jax
 import numpy as np
 
 import tdf_jax as tdf
-from tdf_jax.landscape import shared_lattice as lattice
 from tdf_jax.evaluation.cases import mug_of
+from tdf_jax.landscape import shared_lattice as lattice
 
 HALF, COUNT, PITCH, LATTICE, POSES = 0.6, 101, 0.012, (6, 6, 7), 7
 VOLUME_HALF, VOLUME_COUNT = 0.3, 64

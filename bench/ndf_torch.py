@@ -210,7 +210,7 @@ def descriptor_losses(network: OccupancyNetwork, problem: Problem, R: Tensor, pl
 
 
 def pose_losses(problem: Problem, R: Tensor, place: Tensor) -> Tensor:
-    """k ||T_ref - T||, mean over poses, (starts,); the norm is zero with gradient zero where they agree."""
+    """K ||T_ref - T||, mean over poses, (starts,); the norm is zero with gradient zero where they agree."""
     shift = place - R @ problem.query.mean(0) - problem.origin - problem.t_ref
     turn = problem.lever * (R - problem.R_ref).flatten(-2)
     return problem.correlation * torch.linalg.vector_norm(torch.cat([shift, turn], dim=-1), dim=-1).mean(-1)

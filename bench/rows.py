@@ -8,8 +8,8 @@ import numpy as np
 import tdf_jax as tdf
 from bench import flops, machine, scene
 from bench.measure import OURS, PEERS, Plan, Row, check, difference
-from tdf_jax.landscape import shared_lattice as lattice
 from tdf_jax._internal.errors import InputError
+from tdf_jax.landscape import shared_lattice as lattice
 
 NDF_RATES = {"rotation_rate": 0.01, "translation_rate": 0.01, "final_rate": 1.0}  # NDF's Adam, 1e-2 throughout
 POINT_BYTES = {"torch": 95e3, "torch_tuned": 120e3}  # of one query point's graph; measured 87 and 104 kB, tuned heaps have holes

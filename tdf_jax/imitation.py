@@ -20,7 +20,7 @@ from tdf_jax.solvers.initial import default_goal
 from tdf_jax.solvers.multistart import SolveConfig, solve
 from tdf_jax.solvers.pick import CarryConfig, carry
 from tdf_jax.solvers.result import Result
-from tdf_jax.uncertainty.calibration import CALIBRATED, CURVES, recognition, surface_logit, confidence
+from tdf_jax.uncertainty.calibration import CALIBRATED, CURVES, confidence, recognition, surface_logit
 
 DOUBT = 0.5  # probability of the demonstration's category below which a warning is issued
 

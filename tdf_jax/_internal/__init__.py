@@ -1,8 +1,9 @@
 """What every package uses and no user imports.
 
-    checks     validators of arguments
-    devices    work shared among devices
-    errors     the exception of a user's mistake, and warnings
-    files      atomic writes; results kept between runs
-    precision  full float32 products on every device
+Modules:
+    checks: validators of arguments
+    devices: work shared among devices
+    errors: the exception of a user's mistake, and warnings
+    files: atomic writes; results kept between runs
+    precision: full float32 products on every device
 """

@@ -32,7 +32,7 @@ def check_mesh(function: str, mesh) -> None:
 
 
 def alone() -> Mesh:
-    """jax's default device of this process as a mesh."""
+    """Jax's default device of this process as a mesh."""
     return Mesh(np.array(list(jnp.zeros(()).devices())), ("alone",))
 
 

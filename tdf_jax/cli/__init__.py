@@ -1,5 +1,6 @@
 """The command line, `tdf`: one file a command, named as the command.
 
-    main     the commands, and errors as messages
-    options  options that commands share
+Modules:
+    main: the commands, and errors as messages
+    options: options that commands share
 """

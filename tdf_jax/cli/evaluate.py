@@ -131,7 +131,6 @@ def _check_place(place: str | None, categories: tuple[str, ...]) -> None:
 
 def _check_outputs(json: Path | None, card: Path | None, figures: Path | None) -> None:
     """Refuse now what could not be written in an hour."""
-
     for name, path in (("json", json), ("card", card)):
         if path is not None and (path.is_dir() or not path.parent.is_dir()):
             raise InputError(f"tdf evaluate: --{name} is {path}; expected a file in an existing folder")

@@ -8,15 +8,13 @@ from typing import Annotated, Literal
 import tyro
 from tqdm import tqdm
 
-from tdf_jax.networks.checkpoint import load_model
 from tdf_jax._internal.errors import InputError
-from tdf_jax.paper import figures
-from tdf_jax.paper import figure2 as landscapes
-from tdf_jax.paper import table
+from tdf_jax._internal.files import replace_file
+from tdf_jax.networks.checkpoint import load_model
+from tdf_jax.paper import figure2 as landscapes, figures, table
 from tdf_jax.paper.runs import Run
 from tdf_jax.paper.setting import Setting, scene
 from tdf_jax.paper.store import Store
-from tdf_jax._internal.files import replace_file
 
 EXPERIMENTS = ("table1", "fig1", "fig2", "fig3", "fig4", "fig5")
 # What each sets itself; "all" is all of them.

@@ -26,8 +26,8 @@ def shapes(
 
     from tdf_jax._internal.errors import InputError
     from tdf_jax.evaluation.annotated_meshes import load_annotated
-    from tdf_jax.shapes import FAMILIES
     from tdf_jax.geometry.symmetry import FOLDS
+    from tdf_jax.shapes import FAMILIES
     from tdf_jax.viz.contact_sheet import contact_sheet
     from tdf_jax.viz.style import save_figure
 

@@ -7,13 +7,13 @@ from typing import Annotated
 
 import tyro
 
-from tdf_jax.networks.checkpoint import SUFFIX, load_model, save_model
 from tdf_jax._internal.errors import InputError
+from tdf_jax.networks.checkpoint import SUFFIX, load_model, save_model
 from tdf_jax.networks.model import Model, ModelInfo
-from tdf_jax.training.prefetch import usual_workers
 from tdf_jax.training.config import TrainConfig
 from tdf_jax.training.dataset import Recipe, build, joined, load
 from tdf_jax.training.loop import steps_within, train as run
+from tdf_jax.training.prefetch import usual_workers
 from tdf_jax.training.run_folder import metrics, settings_of
 
 
@@ -45,8 +45,8 @@ def train(
         workers: processes that draw the samples of the steps to come.
         config: settings of the run.
     """
-    from tdf_jax.viz.training import training_figure
     from tdf_jax.viz.style import save_figure
+    from tdf_jax.viz.training import training_figure
 
     if minutes is not None and not 0 < minutes < float("inf"):
         raise InputError(f"tdf train: --minutes is {minutes}; expected a positive number")

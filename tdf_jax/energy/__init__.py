@@ -1,7 +1,8 @@
 """Descriptors of poses, and how far a trajectory is from the demonstration.
 
-    descriptors  eq. 1: descriptors of poses and trajectories
-    losses       eq. 2, 3 and 6: the energy of one trajectory
-    reference    what one or several demonstrations ask for
-    residual     what a pick leaves unmatched
+Modules:
+    descriptors: eq. 1: descriptors of poses and trajectories
+    losses: eq. 2, 3 and 6: the energy of one trajectory
+    reference: what one or several demonstrations ask for
+    residual: what a pick leaves unmatched
 """

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tdf_jax.geometry import se3 as poses
-from tdf_jax.energy.reference import Reference
 from tdf_jax._internal.errors import InputError
-from tdf_jax.networks.field import DescriptorField
+from tdf_jax.energy.reference import Reference
+from tdf_jax.geometry import se3 as poses
 from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.networks.field import DescriptorField
 
 POSE_NORMS = ("frobenius", "metres_radians", "mean_absolute")
 COMPENSATOR_ORDERS = ("frobenius", "infinity")

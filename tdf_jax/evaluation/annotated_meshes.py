@@ -57,7 +57,7 @@ class AnnotatedMesh:
     category: str = "mug"
     fold: int = 1
 
-    def contains(self, points: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"] | None:
+    def contains(self, points: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, " points"] | None:
         """Which points, (points, 3), metres, canonical frame, lie in the clay; None for an open surface."""
         return inside(self.mesh, points)
 

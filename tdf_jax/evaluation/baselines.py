@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float
 from tqdm import tqdm
 
-from tdf_jax.geometry import se3 as poses
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.cases import Case
+from tdf_jax.geometry import se3 as poses
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -68,7 +68,7 @@ def iterative_closest_points(
 
 def settled_points(
     points_a: Float[np.ndarray, "points 3"], points_b: Float[np.ndarray, "seen 3"], rotations: Float[np.ndarray, "starts 3 3"]
-) -> tuple[Float[np.ndarray, "starts 4 4"], Float[np.ndarray, "starts"]]:
+) -> tuple[Float[np.ndarray, "starts 4 4"], Float[np.ndarray, " starts"]]:
     """Where point-to-point ICP settles from every start, see `iterative_closest_points`.
 
     Returns:

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.baselines import METHODS, aligned
 from tdf_jax.evaluation.cases import Case
-from tdf_jax.evaluation.statistics import summary
 from tdf_jax.evaluation.pick_transfer import no_overlaps, overlaps, place_errors, tilts, transferred
+from tdf_jax.evaluation.statistics import summary
 from tdf_jax.networks.model import Model
 from tdf_jax.networks.occupancy import initialise
 from tdf_jax.solvers.adam import OptimizeConfig
@@ -37,8 +37,8 @@ class Outcome:
     method: str
     cases: Sequence[Case]
     found: Float[np.ndarray, "cases 7"]
-    distance: Float[np.ndarray, "cases"]
-    angle: Float[np.ndarray, "cases"]
+    distance: Float[np.ndarray, " cases"]
+    angle: Float[np.ndarray, " cases"]
     ious: Mapping[str, Sequence[float | None]]
     summary: dict
 

@@ -61,7 +61,7 @@ class Attempt:
     """
 
     trajectories: Float[np.ndarray, "starts poses 7"]
-    scores: Float[np.ndarray, "starts"]
+    scores: Float[np.ndarray, " starts"]
     seconds: float
     residual: float = float("nan")
 
@@ -71,7 +71,7 @@ class Attempt:
         return int(np.argmin(np.where(self.finite, self.scores, np.inf)))
 
     @property
-    def finite(self) -> Bool[np.ndarray, "starts"]:
+    def finite(self) -> Bool[np.ndarray, " starts"]:
         """Which starts stayed finite."""
         return np.isfinite(self.scores) & np.isfinite(self.trajectories).all(axis=(1, 2))
 

@@ -2,8 +2,17 @@
 
 from pathlib import Path
 
-from tdf_jax.evaluation.report import SYMMETRY_HEADS, THRESHOLDS, Outcomes, by_symmetry, is_real, overlap_cells, place, successes
 from tdf_jax._internal.files import replace_file
+from tdf_jax.evaluation.report import (
+    SYMMETRY_HEADS,
+    THRESHOLDS,
+    Outcomes,
+    by_symmetry,
+    is_real,
+    overlap_cells,
+    place,
+    successes,
+)
 from tdf_jax.networks.model import Model
 from tdf_jax.networks.occupancy import parameter_count
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import jax
 from tqdm import tqdm
 
-from tdf_jax.evaluation.methods import METHODS, Attempt, Attempts, tried
-from tdf_jax.evaluation.path_tasks import Task
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import kept
+from tdf_jax.evaluation.methods import METHODS, Attempt, Attempts, tried
+from tdf_jax.evaluation.path_tasks import Task
 from tdf_jax.networks.model import Model, fingerprint
 
 FORMAT = 1  # of what is kept: raised when an attempt is computed otherwise

@@ -54,7 +54,7 @@ def transferred(
 
 def place_errors(
     found: Float[np.ndarray, "cases 7"], cases: Sequence[Transfer]
-) -> tuple[Float[np.ndarray, "cases"], Float[np.ndarray, "cases"]]:
+) -> tuple[Float[np.ndarray, " cases"], Float[np.ndarray, " cases"]]:
     """Position errors, metres, and rotation errors, degrees, of poses found for cases: from the nearest of a symmetric object's true poses."""
     T_world_found = np.asarray(Trajectory(jnp.asarray(found)).matrices, float)
     truth = np.stack(
@@ -64,7 +64,7 @@ def place_errors(
     return distance, np.degrees(angle)
 
 
-def tilts(found: Float[np.ndarray, "cases 7"], cases: Sequence[Transfer]) -> Float[np.ndarray, "cases"]:
+def tilts(found: Float[np.ndarray, "cases 7"], cases: Sequence[Transfer]) -> Float[np.ndarray, " cases"]:
     """How far poses found for cases are from upright on their object, degrees: the angle between the place's z axis as found and in truth."""
     up = np.asarray(Trajectory(jnp.asarray(found)).matrices, float)[:, :3, 2]
     true = np.stack([case.T_world_place_b[:3, 2] for case in cases])

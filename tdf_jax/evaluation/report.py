@@ -2,14 +2,14 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 
 import jax
 
-from importlib.metadata import version
+from tdf_jax._internal.files import replace_file
 from tdf_jax.evaluation.comparison import Outcome
 from tdf_jax.evaluation.pick_transfer import OVERLAPS
-from tdf_jax._internal.files import replace_file
 from tdf_jax.networks.model import Model
 from tdf_jax.shapes import FAMILIES
 

@@ -14,12 +14,12 @@ RESAMPLES = 2000  # of the bootstrap
 
 
 def summary(
-    distance: Float[np.ndarray, "cases"],
-    angle: Float[np.ndarray, "cases"],
+    distance: Float[np.ndarray, " cases"],
+    angle: Float[np.ndarray, " cases"],
     ious: Mapping[str, Sequence[float | None]],
     cases: Sequence[Case],
     seed: int = 0,
-    tilt: Float[np.ndarray, "cases"] | None = None,
+    tilt: Float[np.ndarray, " cases"] | None = None,
 ) -> dict:
     """Medians, 90th percentiles, success rates with 95 % bootstrap intervals over objects, and flips.
 

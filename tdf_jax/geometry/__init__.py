@@ -1,15 +1,16 @@
 """Poses, trajectories and shapes as numbers; no network.
 
-    demonstration    one trajectory shown on one object
-    distance_fields  signed distances of boxes, meshes and clouds, as obstacles
-    grid             regular grids along a line, in a plane or in a volume
-    paths            demonstrated paths: line, semicircle, wave, lift, tilt, hang
-    query            query points of the gripper or the placing region
-    sampling         points of a surface; farthest-point sampling
-    se3              rotations and rigid poses
-    symmetry         equivalent poses of symmetric objects
-    trajectory       poses of the query frame; resampling and displacing
-    transport        a demonstrated path warped to new ends
-    views            what cameras see of an object
-    winding          inside and outside of a mesh
+Modules:
+    demonstration: one trajectory shown on one object
+    distance_fields: signed distances of boxes, meshes and clouds, as obstacles
+    grid: regular grids along a line, in a plane or in a volume
+    paths: demonstrated paths: line, semicircle, wave, lift, tilt, hang
+    query: query points of the gripper or the placing region
+    sampling: points of a surface; farthest-point sampling
+    se3: rotations and rigid poses
+    symmetry: equivalent poses of symmetric objects
+    trajectory: poses of the query frame; resampling and displacing
+    transport: a demonstrated path warped to new ends
+    views: what cameras see of an object
+    winding: inside and outside of a mesh
 """

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.checks import check_key
+from tdf_jax._internal.errors import InputError
 
 
 def box_query(

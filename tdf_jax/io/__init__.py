@@ -1,7 +1,8 @@
 """Files: reading and writing, and nothing else.
 
-    demonstrations  demonstrations as .npz
-    meshes          meshes: .obj .stl .ply .glb .off
-    pointclouds     clouds: .ply .pcd .xyz .npy .npz
-    trajectories    trajectories as .npz and .tum
+Modules:
+    demonstrations: demonstrations as .npz
+    meshes: meshes: .obj .stl .ply .glb .off
+    pointclouds: clouds: .ply .pcd .xyz .npy .npz
+    trajectories: trajectories as .npz and .tum
 """

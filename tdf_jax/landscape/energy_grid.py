@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tdf_jax.landscape import shared_lattice as lattice
-from tdf_jax.geometry import se3 as poses
-from tdf_jax.energy.reference import Reference
 from tdf_jax._internal.devices import check_mesh
 from tdf_jax._internal.errors import InputError
-from tdf_jax.networks.field import DescriptorField
+from tdf_jax.energy.reference import Reference
+from tdf_jax.geometry import se3 as poses
 from tdf_jax.geometry.grid import Grid
+from tdf_jax.landscape import shared_lattice as lattice
 from tdf_jax.landscape.storage import TEMPERATURE, Landscape
+from tdf_jax.networks.field import DescriptorField
 
 OVER_ROTATIONS = ("best", "each")
 ORTHOGONAL = 1e-4  # how far R R^T may be from the identity

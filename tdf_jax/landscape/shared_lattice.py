@@ -19,8 +19,8 @@ from jax.sharding import NamedSharding
 from jaxtyping import Array, Float, Int
 
 from tdf_jax._internal import devices
-from tdf_jax.networks.field import DescriptorField
 from tdf_jax.geometry.grid import Grid
+from tdf_jax.networks.field import DescriptorField
 
 TOGETHER = 2e-5  # of a step: offsets this near to whole steps apart share nodes; float32 rounding of a query is 3e-6 of 12 mm
 NODES = 8192  # of a tile and layer: 67 MB of descriptors

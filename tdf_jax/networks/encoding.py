@@ -97,7 +97,7 @@ def _average(params, config, clouds, tip):
 
 
 @full_precision
-def agreeing(latents: Float[Array, "thinnings latent 3"], used: Bool[Array, "thinnings"]) -> Bool[Array, "thinnings"]:
+def agreeing(latents: Float[Array, "thinnings latent 3"], used: Bool[Array, " thinnings"]) -> Bool[Array, " thinnings"]:
     """Which latents of one object show it in the same of several poses that it cannot be told apart in.
 
     Thinned this way or that, a symmetric object looks a little more like one of the poses its symmetry makes equal or like another, and the network decides for one of them: a flat

@@ -149,7 +149,7 @@ def _member(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
 
 
 def _byte_order(archive: zipfile.ZipFile, root: str) -> str:
-    """numpy's sign of the storages' byte order; older files do not say, and are little-endian."""
+    """Numpy's sign of the storages' byte order; older files do not say, and are little-endian."""
     if root + "byteorder" not in archive.namelist():
         return "<"
     order = _member(archive, root + "byteorder", limit=16)

@@ -29,9 +29,9 @@ from tdf_jax.networks.vector_neurons import (
     VectorLeakyReLU,
     VectorLinear,
     VectorResidualBlock,
-    vector_dot,
-    map_planes,
     farthest,
+    map_planes,
+    vector_dot,
 )
 
 NORM_FLOOR = 1e-12  # least norm a descriptor is divided by, as in the original
@@ -111,7 +111,7 @@ class Conditioned:
     """
 
     latent: Float[Array, "latent 3"]
-    invariants: Float[Array, "latent"]
+    invariants: Float[Array, " latent"]
     into: tuple
     blocks: tuple
     out: tuple
@@ -161,7 +161,7 @@ class OccupancyNetwork(nn.Module):
         return self.decoder(self.encoder(points))
 
     def encode_latent(
-        self, points: Float[Array, "points 3"], used: Bool[Array, "points"] | None = None, tip: Float[Array, "3"] | None = None
+        self, points: Float[Array, "points 3"], used: Bool[Array, " points"] | None = None, tip: Float[Array, "3"] | None = None
     ) -> Float[Array, "latent 3"]:
         return self.encoder(points, used, tip)
 
@@ -174,7 +174,7 @@ def encode_latent(
     params,
     config: NetworkConfig,
     points: Float[Array, "points 3"],
-    used: Bool[Array, "points"] | None = None,
+    used: Bool[Array, " points"] | None = None,
     tip: Float[Array, "3"] | None = None,
 ) -> Float[Array, "latent 3"]:
     """The latent z of a cloud.
@@ -252,7 +252,7 @@ class Encoder(nn.Module):
         self.fc_c = VectorLinear(hidden, config.latent)
 
     def __call__(
-        self, points: Float[Array, "points 3"], used: Bool[Array, "points"] | None = None, tip: Float[Array, "3"] | None = None
+        self, points: Float[Array, "points 3"], used: Bool[Array, " points"] | None = None, tip: Float[Array, "3"] | None = None
     ) -> Float[Array, "latent 3"]:
         if self.config.asymmetry:
             points = points - self.config.asymmetry * (farthest(points, used) if tip is None else tip)

@@ -94,7 +94,7 @@ class EdgeConvolution(nn.Module):
         self.map_to_feat = VectorMap(3, self.channels)
         self.map_to_dir = VectorMap(3, self.channels)
 
-    def __call__(self, points: Float[Array, "points 3"], used: Bool[Array, "points"] | None = None) -> Vectors:
+    def __call__(self, points: Float[Array, "points 3"], used: Bool[Array, " points"] | None = None) -> Vectors:
         kernels = self.map_to_feat.kernel, self.map_to_dir.kernel
         # Promoted first: products of float32 kernels would round away what float64 points ask for.
         feature, direction = (kernel.astype(jnp.promote_types(kernel.dtype, points.dtype)) for kernel in kernels)
@@ -128,7 +128,7 @@ def _bilinear(a, b):
     return a[0] * b[0], a[0] * b[1] + a[1] * b[0], a[1] * b[1], a[2] * b[2]
 
 
-def nearest_neighbours(points: Float[Array, "points 3"], count: int, used: Bool[Array, "points"] | None = None):
+def nearest_neighbours(points: Float[Array, "points 3"], count: int, used: Bool[Array, " points"] | None = None):
     """Indices (points, count) of the nearest points, or of those used, by Euclidean distance, the point itself included."""
     points = jax.lax.stop_gradient(points)
 
@@ -142,7 +142,7 @@ def nearest_neighbours(points: Float[Array, "points 3"], count: int, used: Bool[
     return jax.lax.map(nearest, points, batch_size=NEIGHBOUR_ROWS)
 
 
-def farthest(points: Float[Array, "points 3"], used: Bool[Array, "points"] | None = None) -> Float[Array, "3"]:
+def farthest(points: Float[Array, "points 3"], used: Bool[Array, " points"] | None = None) -> Float[Array, "3"]:
     """The point of a centred cloud, or of those used, that is farthest from its mean."""
     squared = jnp.sum(points**2, axis=1)
     return points[jnp.argmax(squared if used is None else jnp.where(used, squared, -1))]

@@ -1,9 +1,10 @@
 """The paper's settings, table and figures, as data.
 
-    energy_maps  figure 2: energy landscapes
-    figures      figures 1, 3, 4 and 5
-    runs         one run of a setting
-    setting      what the paper varies
-    store        runs kept by digest
-    table        table 1
+Modules:
+    energy_maps: figure 2: energy landscapes
+    figures: figures 1, 3, 4 and 5
+    runs: one run of a setting
+    setting: what the paper varies
+    store: runs kept by digest
+    table: table 1
 """

@@ -7,11 +7,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from tdf_jax._internal.files import kept
+from tdf_jax.networks.model import Model, fingerprint
 from tdf_jax.paper.energy_maps import Swept, figure2
 from tdf_jax.paper.runs import Run, imitation
 from tdf_jax.paper.setting import SHAPES, Setting
-from tdf_jax._internal.files import kept
-from tdf_jax.networks.model import Model, fingerprint
 
 FORMAT = 2  # of the files, and of what they hold: raised when a run is computed otherwise
 

@@ -1,6 +1,7 @@
 """Trajectories that keep clear of obstacles.
 
-    avoidance  `push_clear`
-    distances  `clearance`: distances of a moving body
-    occupied   an obstacle from a field
+Modules:
+    avoidance: `push_clear`
+    distances: `clearance`: distances of a moving body
+    occupied: an obstacle from a field
 """

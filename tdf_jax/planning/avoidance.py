@@ -21,12 +21,12 @@ from tdf_jax.planning.distances import (
     ROUNDING,
     STEP,
     Obstacle,
-    distances_and_normals,
-    motion_samples,
-    measure,
     body_centres,
-    prepare,
+    distances_and_normals,
+    measure,
+    motion_samples,
     path_lengths,
+    prepare,
 )
 
 POINTS = 64  # of the body that a descent looks at: spread evenly, then some of those that were missed

@@ -1,10 +1,11 @@
 """Parametric object families with ground truth.
 
-    bottle  bottles
-    bowl    bowls
-    mug     mugs
-    shape   what all generated objects share
-    solid   solids of stacked polygons, their meshes and exact inside tests
+Modules:
+    bottle: bottles
+    bowl: bowls
+    mug: mugs
+    shape: what all generated objects share
+    solid: solids of stacked polygons, their meshes and exact inside tests
 """
 
 from collections.abc import Callable

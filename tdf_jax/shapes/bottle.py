@@ -7,12 +7,11 @@ Bottles are solid but for the mouth of an open neck: what sensors see of them is
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from tdf_jax._internal.errors import InputError
+from tdf_jax.geometry.symmetry import ROUND
 from tdf_jax.shapes.shape import Clay, Shape, accepted, check_numbers, frame, is_one_body, moulded
 from tdf_jax.shapes.solid import Loft, bar_line, bends_freely, encloses, inset, section, swept, tube_rings
-from tdf_jax.geometry.symmetry import ROUND
 
 SHOULDERS = ("arc", "slope")
 

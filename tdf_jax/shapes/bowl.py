@@ -6,12 +6,11 @@ Canonical frame: z up along the bowl's axis, an oval's long side along x, the or
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from tdf_jax._internal.errors import InputError
+from tdf_jax.geometry.symmetry import ROUND
 from tdf_jax.shapes.shape import Clay, Shape, accepted, check_numbers, frame, is_one_body, moulded
 from tdf_jax.shapes.solid import Loft, inset, section
-from tdf_jax.geometry.symmetry import ROUND
 
 _PROFILE = 60  # points along the side's profile
 _FLARE_FROM = 0.8  # of the side's height: where a flared or drawn-in rim begins

@@ -65,7 +65,7 @@ class Shape(ABC):
         """Its parts."""
         return self.clay_of(self.parameters)
 
-    def contains(self, points: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:
+    def contains(self, points: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, " points"]:
         """Tell which points lie in the clay, by the planes of the mesh (no ray casting).
 
         Args:

@@ -1,9 +1,10 @@
 """Poses that minimise the energy, from many starts.
 
-    adam          `optimize`: Adam on SO(3) x R^3
-    gauss_newton  damped Gauss-Newton steps on single poses
-    initial       random or given starts, and the goal
-    multistart    `solve`: Gauss-Newton from many starts in stages
-    pick          `carry`: the pick found, the demonstration warped from there to the goal
-    result        what a solver returns
+Modules:
+    adam: `optimize`: Adam on SO(3) x R^3
+    gauss_newton: damped Gauss-Newton steps on single poses
+    initial: random or given starts, and the goal
+    multistart: `solve`: Gauss-Newton from many starts in stages
+    pick: `carry`: the pick found, the demonstration warped from there to the goal
+    result: what a solver returns
 """

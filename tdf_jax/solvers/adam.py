@@ -80,7 +80,7 @@ def optimize(
     energy: EnergyWeights = EnergyWeights(),
     config: OptimizeConfig = OptimizeConfig(),
     starts: Float[Array, "inits poses 7"] | None = None,
-    progress: Callable[[int, Float[np.ndarray, "inits"]], None] | None = None,
+    progress: Callable[[int, Float[np.ndarray, " inits"]], None] | None = None,
     mesh: jax.sharding.Mesh | None = None,
 ) -> Result:
     """Minimise `trajectory_energy` from many starts.

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from tdf_jax._internal import devices
-from tdf_jax.geometry import se3 as poses
-from tdf_jax.energy.reference import Reference
-from tdf_jax.energy.losses import pose_difference
 from tdf_jax._internal.precision import full_precision
+from tdf_jax.energy.losses import pose_difference
+from tdf_jax.energy.reference import Reference
+from tdf_jax.geometry import se3 as poses
 
 LARGEST_TURN, LARGEST_MOVE = 0.7, 0.05  # radians and metres of one step
 DAMPINGS = 1e-3, 1e3  # least and greatest
@@ -69,7 +69,7 @@ class _State(NamedTuple):
 
     R: Float[Array, "poses 3 3"]
     place: Float[Array, "poses 3"]
-    energy: Float[Array, "poses"]
+    energy: Float[Array, " poses"]
     gradient: Float[Array, "poses 6"]
     hessian: Float[Array, "poses 6 6"]
 

@@ -109,7 +109,7 @@ def solve(
     energy: EnergyWeights = EnergyWeights(),
     config: SolveConfig = SolveConfig(),
     starts: Float[Array, "inits poses 7"] | None = None,
-    progress: Callable[[int, Float[np.ndarray, "finalists"]], None] | None = None,
+    progress: Callable[[int, Float[np.ndarray, " finalists"]], None] | None = None,
     mesh: jax.sharding.Mesh | None = None,
 ) -> Result:
     """Minimise `trajectory_energy` by damped Gauss-Newton steps from many starts, in six stages (see the module).

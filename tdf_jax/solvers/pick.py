@@ -72,7 +72,7 @@ def carry(
     goal: Float[Array, "7"] | None = None,
     fix_last: bool = True,
     config: CarryConfig = CarryConfig(),
-    progress: Callable[[int, Float[np.ndarray, "finalists"]], None] | None = None,
+    progress: Callable[[int, Float[np.ndarray, " finalists"]], None] | None = None,
     mesh: jax.sharding.Mesh | None = None,
 ) -> Result:
     """Find the pick by its descriptors (eq. 2 of one waypoint) and carry the demonstration from there to the goal.

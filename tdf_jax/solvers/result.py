@@ -30,14 +30,14 @@ class Result:
 
     trajectories: Float[Array, "inits poses 7"]
     losses: Float[Array, "inits iterations"]
-    energies: Float[Array, "inits"]
+    energies: Float[Array, " inits"]
     starts: Float[Array, "inits poses 7"]
     residual: float | None = None
     confidence: float | None = None
     recognised: float | None = None
 
     @property
-    def finite(self) -> Bool[np.ndarray, "inits"]:
+    def finite(self) -> Bool[np.ndarray, " inits"]:
         """Which starts stayed finite."""
         return np.isfinite(self.energies) & np.isfinite(self.trajectories).all(axis=(1, 2))
 

@@ -19,11 +19,11 @@ from tdf_jax.evaluation.pick_transfer import place_errors, transferred
 from tdf_jax.networks.model import Model, ModelInfo
 from tdf_jax.networks.occupancy import encode_latent, initialise
 from tdf_jax.solvers.adam import OptimizeConfig
-from tdf_jax.training.prefetch import asked_ahead, drawn_ahead
 from tdf_jax.training.batch import VALIDATION_DIAGONAL, Batch, draw, validation_pairs
 from tdf_jax.training.config import TrainConfig
 from tdf_jax.training.dataset import DataSet
 from tdf_jax.training.objective import FRONT, UP, mean_gradient, pair_loss
+from tdf_jax.training.prefetch import asked_ahead, drawn_ahead
 from tdf_jax.training.run_folder import METRICS, claim, drop_later_metrics, restore, save
 
 CORRUPTING = (0.1, 0.6)  # shares of the run

@@ -1,6 +1,7 @@
 """How sure a pick is.
 
-    calibration  confidence and recognition: logistic curves, their fit and reliability
-    covariance   curvature, covariance and free directions of a pose
-    modes        distinct solutions among the starts
+Modules:
+    calibration: confidence and recognition: logistic curves, their fit and reliability
+    covariance: curvature, covariance and free directions of a pose
+    modes: distinct solutions among the starts
 """

@@ -29,12 +29,12 @@ class Mode:
 
     pose: Float[np.ndarray, "7"]
     energy: float
-    members: Int[np.ndarray, "members"]
+    members: Int[np.ndarray, " members"]
     share: float
 
 
 def cluster_poses(
-    wxyz_xyz: Float[Array, "inits 7"], energies: Float[Array, "inits"], *, angle: float = SAME_ANGLE, distance: float = SAME_DISTANCE
+    wxyz_xyz: Float[Array, "inits 7"], energies: Float[Array, " inits"], *, angle: float = SAME_ANGLE, distance: float = SAME_DISTANCE
 ) -> list[Mode]:
     """The distinct poses among those that several starts came to.
 

@@ -12,7 +12,17 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
 from tdf_jax.landscape.storage import Landscape
 from tdf_jax.viz import polygons3d as solid
-from tdf_jax.viz.landscapes import ANGLES, LEVELS, SEE_THROUGH, SHOWN, SURFACES, Marks, check_landscape, path_lines, isosurface
+from tdf_jax.viz.landscapes import (
+    ANGLES,
+    LEVELS,
+    SEE_THROUGH,
+    SHOWN,
+    SURFACES,
+    Marks,
+    check_landscape,
+    isosurface,
+    path_lines,
+)
 from tdf_jax.viz.style import CENTIMETRES, CLOUD
 
 if TYPE_CHECKING:

@@ -6,13 +6,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
 from tdf_jax.evaluation.scene import Scene
-from tdf_jax.paper.figures import PAPER_DISTANCES, mean_over_seeds, turned
+from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.paper.energy_maps import Swept
+from tdf_jax.paper.figures import PAPER_DISTANCES, mean_over_seeds, turned
 from tdf_jax.paper.runs import Run
 from tdf_jax.paper.table import vector
-from tdf_jax.geometry.trajectory import Trajectory
-from tdf_jax.viz.style import CLOUD, COLOURS, INK, STYLE, TRUTH, blank_figure, legend_of
 from tdf_jax.viz.scene3d import WIDTH, View, bounds, panels, triangles_of
+from tdf_jax.viz.style import CLOUD, COLOURS, INK, STYLE, TRUTH, blank_figure, legend_of
 
 SHAPE_COLOURS = {"line": COLOURS(0.05), "semicircle": COLOURS(0.5), "wave": COLOURS(0.85)}
 SHAPE_STYLES = {"line": "-", "semicircle": "--", "wave": "-."}  # told apart without colour too

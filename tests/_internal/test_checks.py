@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import tdf_jax as tdf
-from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.checks import check_key
+from tdf_jax._internal.errors import InputError
 
 
 @pytest.mark.parametrize("key", [jax.random.key(0), jax.random.PRNGKey(0)])

@@ -12,9 +12,18 @@ torch = pytest.importorskip("torch")
 
 # After it, for these import torch themselves.
 import tdf_jax as tdf  # noqa: E402
-from bench import __main__ as command_line  # noqa: E402
-from bench import flops, gate, machine, ndf_torch, ours, peer, report, scene  # noqa: E402
-from bench import rows as all_rows  # noqa: E402
+from bench import (  # noqa: E402
+    __main__ as command_line,  # noqa: E402
+    flops,
+    gate,
+    machine,
+    ndf_torch,
+    ours,
+    peer,
+    report,
+    rows as all_rows,  # noqa: E402
+    scene,
+)
 from bench.measure import Plan, Row, check, measure, ratios  # noqa: E402
 from bench.rows import NDF_RATES, QUICK, agree, rows  # noqa: E402
 from bench.workers import WorkerError, Workers  # noqa: E402

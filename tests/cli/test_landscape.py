@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import tdf_jax as tdf
-from tdf_jax.landscape import shared_lattice as lattice
 from tdf_jax.cli import landscape as command
 from tdf_jax.cli.main import main
 from tdf_jax.io.demonstrations import save_demonstration
+from tdf_jax.landscape import shared_lattice as lattice
 
 QUICK = ("--points", 60, "--poses", 3, "--queries", 8, "--half", 0.1, "--pitch", 0.05)
 

@@ -10,13 +10,11 @@ from conftest import random_poses
 import tdf_jax as tdf
 from tdf_jax.cli import reproduce as command
 from tdf_jax.cli.main import main
-from tdf_jax.paper import figures
-from tdf_jax.viz import paper as pictures
-from tdf_jax.paper import setting as settings
-from tdf_jax.paper import table
+from tdf_jax.paper import figures, setting as settings, table
 from tdf_jax.paper.energy_maps import Swept
 from tdf_jax.paper.runs import Run
 from tdf_jax.paper.setting import Setting
+from tdf_jax.viz import paper as pictures
 
 TINY = Setting(poses=3, iterations=2, queries=8, inits=2)
 WORDS = ("--poses", "3", "--iterations", "2", "--queries", "8", "--inits", "2")

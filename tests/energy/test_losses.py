@@ -10,10 +10,10 @@ from conftest import carried, compilations, composed, enabled, random_cloud, ran
 from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
-from tdf_jax.geometry import se3 as poses
-from tdf_jax.energy.reference import Reference
-from tdf_jax.energy.losses import POSE_NORMS, pose_energy, waypoint_loss
 from tdf_jax._internal.errors import InputError
+from tdf_jax.energy.losses import POSE_NORMS, pose_energy, waypoint_loss
+from tdf_jax.energy.reference import Reference
+from tdf_jax.geometry import se3 as poses
 
 HALF = np.sqrt(0.5)
 QUARTER_TURN_Z = [HALF, 0, 0, HALF]

@@ -10,12 +10,12 @@ import trimesh
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.annotated_meshes import load_annotated
+from tdf_jax.evaluation.axis_profiles import profile, profile_places
 from tdf_jax.evaluation.cases import mug_of
 from tdf_jax.evaluation.places import body, measured_places
-from tdf_jax.evaluation.axis_profiles import profile, profile_places
+from tdf_jax.geometry.symmetry import FOLDS
 from tdf_jax.io.meshes import file_axes
 from tdf_jax.shapes import FAMILIES, BottleParameters, BowlParameters, build_bottle, build_bowl, build_mug
-from tdf_jax.geometry.symmetry import FOLDS
 
 DOCS = Path(__file__).parents[2] / "docs" / "evaluation.md"
 ENTRY = {"unit": 1, "up": "+z", "handle": "+x"}

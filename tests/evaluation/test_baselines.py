@@ -6,11 +6,18 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from tdf_jax.geometry import se3 as poses
 from tdf_jax._internal.errors import InputError
-from tdf_jax.evaluation.baselines import aligned, chamfer_distance, iterative_closest_points, principal_axes, rigid_motion, settled_points
+from tdf_jax.evaluation.baselines import (
+    aligned,
+    chamfer_distance,
+    iterative_closest_points,
+    principal_axes,
+    rigid_motion,
+    settled_points,
+)
 from tdf_jax.evaluation.cases import mug_case
 from tdf_jax.evaluation.pick_transfer import place_errors
+from tdf_jax.geometry import se3 as poses
 
 
 def motion(seed):

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import re
-import sys
 from types import SimpleNamespace
 
 import jax
@@ -17,9 +16,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import binomtest
 
 import tdf_jax as tdf
-from tdf_jax.energy.residual import pick_residual
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import EnergyWeights, trajectory_energy
+from tdf_jax.energy.residual import pick_residual
 from tdf_jax.evaluation import demonstration_count as demonstrations, methods, path_scores as scores
 from tdf_jax.evaluation.annotated_meshes import AnnotatedMesh
 from tdf_jax.evaluation.cases import mug_case

@@ -7,13 +7,12 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
-from tdf_jax.geometry import se3 as poses
 from tdf_jax._internal.errors import InputError
+from tdf_jax.geometry import se3 as poses
 
 TOLERANCE = {jnp.float32: 2e-5, jnp.float64: 1e-10}
 # Zero, far below and just about the borders of the power series (0.0632 in log, 0.1732 in exp), pi, and beyond.

@@ -9,11 +9,11 @@ import pytest
 from conftest import compilations, random_cloud, random_poses
 
 import tdf_jax as tdf
-from tdf_jax.landscape import shared_lattice as lattice
-from tdf_jax.geometry import se3 as poses
-from tdf_jax.energy.losses import waypoint_loss
 from tdf_jax._internal.errors import InputError
+from tdf_jax.energy.losses import waypoint_loss
+from tdf_jax.geometry import se3 as poses
 from tdf_jax.geometry.grid import Grid, path_grid, plane_grid, volume_grid
+from tdf_jax.landscape import shared_lattice as lattice
 from tdf_jax.landscape.energy_grid import blank, energy_landscape, fill, query_change
 
 RANDOM = np.asarray(poses.rotation(jnp.asarray(random_poses(5, 3), jnp.float32)))

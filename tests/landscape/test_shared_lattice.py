@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import tdf_jax as tdf
-from tdf_jax.landscape import shared_lattice as lattice
 from tdf_jax.geometry.grid import Grid, path_grid, plane_grid, volume_grid
+from tdf_jax.landscape import shared_lattice as lattice
 
 TILTED = np.array([[np.cos(0.5), np.sin(0.5), 0.0], [-np.sin(0.5), np.cos(0.5), 0.0], [0.0, 0.0, 1.0]])
 

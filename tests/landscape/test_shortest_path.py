@@ -7,8 +7,8 @@ import pytest
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.grid import Grid, path_grid, plane_grid, volume_grid
-from tdf_jax.landscape.storage import Landscape
 from tdf_jax.landscape.shortest_path import lowest_cost_path
+from tdf_jax.landscape.storage import Landscape
 
 
 def of(grid, energy):

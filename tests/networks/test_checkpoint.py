@@ -10,9 +10,9 @@ import safetensors
 import safetensors.numpy
 from flax.traverse_util import flatten_dict, unflatten_dict
 
+from tdf_jax._internal.errors import InputError
 from tdf_jax.networks import checkpoint
 from tdf_jax.networks.checkpoint import available_models, load_model, save_model
-from tdf_jax._internal.errors import InputError
 from tdf_jax.networks.model import Model, ModelInfo
 from tdf_jax.networks.occupancy import NetworkConfig, parameter_shapes
 

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from flax.traverse_util import flatten_dict
 
-from tdf_jax.networks.checkpoint import load_model
-from tdf_jax.cli.convert import convert
-from tdf_jax.networks.ndf_checkpoint import convert_checkpoint
 from tdf_jax._internal.errors import InputError
+from tdf_jax.cli.convert import convert
+from tdf_jax.networks.checkpoint import load_model
+from tdf_jax.networks.ndf_checkpoint import convert_checkpoint
 from tdf_jax.networks.occupancy import NetworkConfig, parameter_shapes
 from tdf_jax.networks.torch_pickle import Refusal, interpret
 

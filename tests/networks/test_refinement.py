@@ -7,9 +7,9 @@ import pytest
 from conftest import compilations, enabled, random_cloud, random_poses
 
 import tdf_jax as tdf
+from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3 as poses
 from tdf_jax.networks import refinement
-from tdf_jax._internal.errors import InputError
 
 
 def miss(field, points):

@@ -13,14 +13,11 @@ from scipy.spatial.transform import Rotation
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.metrics import shape_error
-from tdf_jax.paper import figures
-from tdf_jax.paper import figure2 as landscapes
-from tdf_jax.paper import setting as settings
-from tdf_jax.paper import table
+from tdf_jax.geometry.grid import distance_from_polyline
+from tdf_jax.paper import figure2 as landscapes, figures, setting as settings, table
 from tdf_jax.paper.runs import Run, imitation
 from tdf_jax.paper.setting import Setting
 from tdf_jax.paper.store import Store
-from tdf_jax.geometry.grid import distance_from_polyline
 
 TINY = Setting(poses=3, iterations=4, queries=8, inits=2)
 

@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 from tdf_jax._internal.errors import InputError
-from tdf_jax.shapes import FAMILIES, HANDLE_STYLES, BottleParameters, BowlParameters, MugParameters, build_mug, sample_mug, scaled
+from tdf_jax.shapes import (
+    FAMILIES,
+    HANDLE_STYLES,
+    BottleParameters,
+    BowlParameters,
+    MugParameters,
+    build_mug,
+    sample_mug,
+    scaled,
+)
 
 VARIANTS = [
     MugParameters(),

@@ -12,8 +12,7 @@ import pytest
 from tdf_jax._internal.errors import InputError
 from tdf_jax.networks.occupancy import NetworkConfig, parameter_shapes
 from tdf_jax.solvers.adam import OptimizeConfig
-from tdf_jax.training import dataset, loop
-from tdf_jax.training import run_folder as record
+from tdf_jax.training import dataset, loop, run_folder as record
 from tdf_jax.training.config import TrainConfig
 from tdf_jax.training.dataset import Recipe, joined
 from tdf_jax.training.objective import FRONT, UP, frame_error

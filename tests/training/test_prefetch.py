@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 
 from tdf_jax._internal.errors import InputError
-from tdf_jax.training import dataset
-from tdf_jax.training import prefetch as ahead
-from tdf_jax.training.prefetch import drawn_ahead
+from tdf_jax.training import dataset, prefetch as ahead
 from tdf_jax.training.config import TrainConfig
 from tdf_jax.training.dataset import Recipe, joined
 from tdf_jax.training.loop import batch_of
+from tdf_jax.training.prefetch import drawn_ahead
 
 CONFIG = TrainConfig(seed=3, steps=40, batch=2, points=32, queries=16, box=4, poses=2)
 

@@ -208,7 +208,7 @@ def test_where_the_energy_falls_the_curvature_is_negative_and_the_direction_coun
 )
 def test_a_twist_is_a_motion_about_an_axis(twist, direction, point, pitch):
     centre = np.array([0.1, 0.3, 0.1])
-    screw = covariance._screw(np.array(twist, float), centre, 0.03)
+    screw = covariance_module._screw(np.array(twist, float), centre, 0.03)
     np.testing.assert_allclose(screw.direction, direction, atol=1e-12)
     np.testing.assert_allclose(screw.point, point, atol=1e-12)
     assert screw.pitch == pytest.approx(pitch)
@@ -223,7 +223,7 @@ def test_twists_are_turns_about_their_axis_at_any_angle():
     axis *= 2.5 / np.linalg.norm(axis)
     for share in (1e-6, 0.01, 1.0):
         turn = share * axis
-        R, moved = covariance._screwed(jnp.eye(3), jnp.asarray(turn, jnp.float32), jnp.asarray(np.cross(turn, centre - point), jnp.float32))
+        R, moved = covariance_module._screwed(jnp.eye(3), jnp.asarray(turn, jnp.float32), jnp.asarray(np.cross(turn, centre - point), jnp.float32))
         expected = Rotation.from_rotvec(turn)
         np.testing.assert_allclose(R, expected.as_matrix(), atol=1e-6)
         np.testing.assert_allclose(moved, expected.apply(centre - point) + point - centre, atol=2e-6)
