@@ -1,11 +1,12 @@
 """tdf_jax against PyTorch, in one run and in turns.
 
     python -m bench --out results             # all rows: bench.json and bench.md; about half an hour on two cores
-    python -m bench --only encode_1500 step_10
-    python -m bench --gate                    # exit code 1 where a check fails or a ratio fell below 0.6 of bench/baseline.json's
-    python -m bench --scaling --out results   # and curves over starts, poses, query points and cloud points, as scaling.png
+    python -m bench --only encode_1500 step_10 python -m bench --gate                    # exit code 1 where a check
+    fails or a ratio fell below 0.6 of bench/baseline.json's python -m bench --scaling --out results   # and curves over
+    starts, poses, query points and cloud points, as scaling.png
 
-It needs an idle machine: PyTorch's threads wait for each other at every operation, and lose far more than their share to another process.
+It needs an idle machine: PyTorch's threads wait for each other at every operation, and lose far more than their share
+to another process.
 """
 
 import argparse

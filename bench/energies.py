@@ -1,6 +1,7 @@
 """Does the solver come as far down as Adam? Energies of both on pairs of unseen mugs and on the rows of the paper's table 1.
 
-`python -m bench.energies` asks for 50 pairs and nine rows, about 20 s each on two cores. What is done is kept in the file, and not done again.
+`python -m bench.energies` asks for 50 pairs and nine rows, about 20 s each on two cores. What is done is kept in the
+file, and not done again.
 """
 
 import argparse

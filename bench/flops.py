@@ -1,8 +1,9 @@
 """Floating-point operations of each row, counted in one place.
 
-Counted are the multiplications and additions of the matrix products that the task needs in its leanest known form, the same for all
-competitors: what a competitor does beyond that (repeated latents, edge features, weight gradients nobody asked for) lowers its
-rate, as it should. Element-wise work, neighbour search and sums of differences are not counted, so 100 % of the matmul peak cannot be reached.
+Counted are the multiplications and additions of the matrix products that the task needs in its leanest known form, the
+same for all competitors: what a competitor does beyond that (repeated latents, edge features, weight gradients nobody
+asked for) lowers its rate, as it should. Element-wise work, neighbour search and sums of differences are not counted,
+so 100 % of the matmul peak cannot be reached.
 """
 
 from tdf_jax.networks.occupancy import NetworkConfig
@@ -13,8 +14,8 @@ EDGE_PRODUCTS = 4  # (e.e, e.x, x.x, c.c): what <feature, d> and |d|^2 of an edg
 def encoder(points: int, config: NetworkConfig = NetworkConfig()) -> float:
     """One cloud. Every linear map of vectors counts three times, for x, y and z.
 
-    Edges: two products of 4 by `hidden` for each of 20 neighbours, and a linear map of the pooled edges. After the first residual block
-    the pooled half of the input is one vector for all points, so maps of it are not counted.
+    Edges: two products of 4 by `hidden` for each of 20 neighbours, and a linear map of the pooled edges. After the
+    first residual block the pooled half of the input is one vector for all points, so maps of it are not counted.
     """
     hidden, width = config.vector_hidden, config.vector_width
     edges = 2 * EDGE_PRODUCTS * config.neighbours * hidden + 3 * 2 * 3 * hidden

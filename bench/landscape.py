@@ -1,7 +1,7 @@
 """Energy landscapes: a lattice's shared sweep against one evaluation for each (grid point, query point), in one run, alternating.
 
-    python -m bench.landscape              # the plane: 101 x 101 points 12 mm apart, 6 x 6 x 7 query points, 7 waypoints
-    python -m bench.landscape --volume     # and the volume: 64^3 points over +-0.3 m, shared only
+    python -m bench.landscape              # the plane: 101 x 101 points 12 mm apart, 6 x 6 x 7 query points, 7
+    waypoints python -m bench.landscape --volume     # and the volume: 64^3 points over +-0.3 m, shared only
 
 Both sweeps share each evaluation between waypoints and use the same sums; compilation is apart.
 """

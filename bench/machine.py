@@ -46,7 +46,8 @@ def peak() -> float:
 def settle() -> None:
     """Return freed memory to the system and begin a new peak.
 
-    A child of glibc that keeps all it ever had (the tuned PyTorch) would otherwise show the largest row before this one.
+    A child of glibc that keeps all it ever had (the tuned PyTorch) would otherwise show the largest row before this
+    one.
     """
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)

@@ -45,7 +45,8 @@ class Row:
         arrays: makes the inputs, the same for all.
         plans: competitors in the order they take turns.
         check: from results by competitor to checks, and facts to report.
-        flops: operations of the whole row, see `bench.flops`; of each competitor where they differ, 0 where they are not known.
+        flops: operations of the whole row, see `bench.flops`; of each competitor where they differ, 0 where they are
+            not known.
         most: repetitions at most, for rows of minutes.
     """
 
@@ -80,8 +81,8 @@ def measure(row: Row, workers: Workers, state: dict, repetitions: int) -> dict:
         repetitions: of every competitor, after a first call that warms up or compiles.
 
     Returns:
-        A JSON-ready record: competitors' times and memory, ratios, checks, facts, and the errors of those that failed. Where a check fails, times
-        are those of first calls and no ratios are given.
+        A JSON-ready record: competitors' times and memory, ratios, checks, facts, and the errors of those that failed.
+        Where a check fails, times are those of first calls and no ratios are given.
     """
     runs, failed = {}, {}
     arrays = row.arrays()

@@ -1,8 +1,8 @@
 """The peer: NDF's occupancy network, point descriptors and trajectory energy in plain PyTorch, autograd for everything.
 
-Written in the manner of the published code: a batch is (objects, channels, 3, points), a latent is repeated for every query point and
-concatenated with it, and a descriptor concatenates the decoder's layers. Module names are the checkpoints', so `load_state_dict` takes
-them as they are.
+Written in the manner of the published code: a batch is (objects, channels, 3, points), a latent is repeated for every
+query point and concatenated with it, and a descriptor concatenates the decoder's layers. Module names are the
+checkpoints', so `load_state_dict` takes them as they are.
 """
 
 import dataclasses
@@ -23,8 +23,8 @@ EPSILON = 1e-6  # added to |d|^2
 def last(x: Tensor) -> Tensor:
     """Channels to the last axis, where `nn.Linear` wants them.
 
-    Made contiguous here: `linear` of recorded tensors copies them anyway, and where nothing is recorded it would otherwise run many small products
-    (encoding 1000 points took 0.37 s without gradients and 0.24 s with them).
+    Made contiguous here: `linear` of recorded tensors copies them anyway, and where nothing is recorded it would
+    otherwise run many small products (encoding 1000 points took 0.37 s without gradients and 0.24 s with them).
     """
     return x.transpose(1, -1).contiguous()
 

@@ -55,7 +55,8 @@ def gradient(model, settings, arrays):
 def descent(model, settings, arrays):
     """`tdf.optimize` from the given starts: the whole call, or per step.
 
-    A call evaluates its starts and its result besides its steps, so a step is the difference of two calls, of one step and of some more.
+    A call evaluates its starts and its result besides its steps, so a step is the difference of two calls, of one step
+    and of some more.
     """
     field, reference, energy = _problem(model, arrays)
     per_step = settings["per"] == "step"
@@ -80,7 +81,8 @@ def descent(model, settings, arrays):
     def call():
         if per_step:
             (first, _), (seconds, result) = timed(1), timed(1 + settings["steps"])
-            more = seconds - first if seconds > first else seconds  # steps of a millisecond drown in noise: then all of the call counts
+            # steps of a millisecond drown in noise: then all of the call counts
+            more = seconds - first if seconds > first else seconds
             return {"losses": result.losses[:, : settings["steps"]], "seconds": more / settings["steps"]}
         seconds, result = timed(settings["iterations"])
         return {"losses": result.losses, "energies": result.energies, "seconds": seconds}

@@ -53,7 +53,8 @@ def energies(workers: Workers, inits: int, poses: int, queries: int) -> list[dic
     for name in ("torch", "torch_tuned", "tdf_jax"):
         workers.ask(name, "prepare", {"task": "gradient", "settings": {}, "arrays": arrays, "state": state})
         found[name] = workers.ask(name, "run")["result"]
-    # The fixed last pose lies where eq. 3's norm has its kink: which way its derivative points there is a matter of rounding.
+    # The fixed last pose lies where eq. 3's norm has its kink: which way its derivative points there is a matter of
+    # rounding.
     found = {name: {kind: part if kind == "energies" else part[:, :-1] for kind, part in result.items()} for name, result in found.items()}
     expected = found.pop("torch")
     return [

@@ -1,8 +1,9 @@
 """The benchmark's tasks in PyTorch.
 
-Each task takes a network, whether an expert tuned it, its settings and its arrays, and gives a function to call again and again that returns its
-results, and "seconds" where not the whole call counts. Tuned: no gradients for weights that nobody trains, one thread a core, the fixed last pose
-evaluated once; what glibc keeps is set where the process is started (`bench.workers`).
+Each task takes a network, whether an expert tuned it, its settings and its arrays, and gives a function to call again
+and again that returns its results, and "seconds" where not the whole call counts. Tuned: no gradients for weights that
+nobody trains, one thread a core, the fixed last pose evaluated once; what glibc keeps is set where the process is
+started (`bench.workers`).
 """
 
 import os
@@ -17,7 +18,8 @@ from bench import ndf_torch
 from bench.machine import cores
 from bench.ndf_torch import OccupancyNetwork, Problem, descriptor_losses, exponential, pose_losses
 
-TOGETHER = {False: 10, True: 2}  # grid points evaluated at a time: as many as NDF's starts; 500 descriptors are 4 MB and stay in cache
+# grid points evaluated at a time: as many as NDF's starts; 500 descriptors are 4 MB and stay in cache
+TOGETHER = {False: 10, True: 2}
 
 
 def prepare(task: str, tuned: bool, settings: dict, arrays: dict, state: dict[str, np.ndarray]) -> Callable[[], dict]:
@@ -64,7 +66,8 @@ def gradient(network, tuned, settings, arrays):
 def descent(network, tuned, settings, arrays):
     """Adam from the given starts. The latent is encoded before, as NDF does, so steps evaluate the decoder alone.
 
-    Settings: steps to take, of `iterations` that the falling rates are laid out for; rates; fix_last; per "step" or "call".
+    Settings: steps to take, of `iterations` that the falling rates are laid out for; rates; fix_last; per "step" or
+    "call".
     """
     problem, R0, places = _problem(network, arrays)
     iterations, steps, fix_last = settings["iterations"], settings["steps"], settings["fix_last"]

@@ -1,7 +1,8 @@
 """Whether objects of a wrong category are noticed: python -m bench.recognition --weights mug.
 
-Every case has a demonstration at the usual place of an unseen generated object. A right one is imitated on another object of that category, a wrong one on an object of
-another; the target is seen in turn complete, by one camera, by two, and as 300 noisy points.
+Every case has a demonstration at the usual place of an unseen generated object. A right one is imitated on another
+object of that category, a wrong one on an object of another; the target is seen in turn complete, by one camera, by
+two, and as 300 noisy points.
 """
 
 import argparse

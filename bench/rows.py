@@ -12,7 +12,8 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.landscape import shared_lattice as lattice
 
 NDF_RATES = {"rotation_rate": 0.01, "translation_rate": 0.01, "final_rate": 1.0}  # NDF's Adam, 1e-2 throughout
-POINT_BYTES = {"torch": 95e3, "torch_tuned": 120e3}  # of one query point's graph; measured 87 and 104 kB, tuned heaps have holes
+# of one query point's graph; measured 87 and 104 kB, tuned heaps have holes
+POINT_BYTES = {"torch": 95e3, "torch_tuned": 120e3}
 MEMORY_SHARE = 0.8  # of the available memory
 LATENTS, LOSSES, VALUES = 1e-4, 1e-3, 1e-4  # Adam's first steps follow signs, which rounding turns
 PROBED = 3  # steps from which the 100 of PyTorch as users run it are estimated: all of them would take minutes
@@ -114,8 +115,8 @@ def step(inits: int, poses: int, queries: int) -> Row:
 def target(sizes: Sizes, same_rates: bool = False) -> Row:
     """Time to the energy that PyTorch's best start has after its steps.
 
-    PyTorch takes NDF's rates, or, as its expert might, those of `tdf.optimize`. Our whole calls count, with default settings; that
-    they reach the target is a check in the first case, and a fact in the second.
+    PyTorch takes NDF's rates, or, as its expert might, those of `tdf.optimize`. Our whole calls count, with default
+    settings; that they reach the target is a check in the first case, and a fact in the second.
     """
     inits, n, queries, iterations = sizes.target_inits, sizes.poses, sizes.queries, sizes.iterations
     default = tdf.OptimizeConfig()
@@ -151,7 +152,8 @@ def target(sizes: Sizes, same_rates: bool = False) -> Row:
         return found, facts
 
     one = flops.decoder_gradient(inits * (n - 1) * queries)
-    work = {name: one * plan.settings.get("iterations", 0) for name, plan in plans.items()}  # `solve` counts its own evaluations
+    # `solve` counts its own evaluations
+    work = {name: one * plan.settings.get("iterations", 0) for name, plan in plans.items()}
     rates = "tdf_jax's rates" if same_rates else "NDF's rates"
     title = f"to the energy of {iterations} steps at {rates}, {inits} x {n} x {queries}"
     about = {"inits": inits, "poses": n, "queries": queries, "iterations": iterations}

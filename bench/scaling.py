@@ -25,8 +25,8 @@ def scaling(workers: Workers, state: dict, quick: bool, repetitions: int, progre
     """Measure the curves; a competitor whose graph would not fit into memory is left out at that size.
 
     Returns:
-        {axis: [{"value", "competitors": {name: {"seconds", "megabytes"}}}]}; one step per value of M, n and Q, one encoding per value of N;
-        megabytes above what the process held before.
+        {axis: [{"value", "competitors": {name: {"seconds", "megabytes"}}}]}; one step per value of M, n and Q, one
+        encoding per value of N; megabytes above what the process held before.
     """
     centre, values = (QUICK_CENTRE, QUICK_VALUES) if quick else (CENTRE, VALUES)
     curves = {}

@@ -39,8 +39,9 @@ def imitation(inits: int, poses: int, queries: int, seed: int = 0) -> dict[str, 
     Clouds are of the weights' density, so that one encoding, the same in all competitors, is enough.
 
     Returns:
-        shown, new: clouds (256, 3); path: the demonstration (poses, 7); query: (queries, 3); goal: (7,); starts (inits, poses, 7), the
-        demonstration turned about the object as a whole by a uniform rotation, ending at the goal. Metres, `wxyz_xyz`, world frame.
+        shown, new: clouds (256, 3); path: the demonstration (poses, 7); query: (queries, 3); goal: (7,); starts (inits,
+        poses, 7), the demonstration turned about the object as a whole by a uniform rotation, ending at the goal.
+        Metres, `wxyz_xyz`, world frame.
     """
     shown, new = (tdf.thin(_surface(index, 1500), 256) for index in (0, 1))
     turn = Rotation.random(random_state=seed)
@@ -81,8 +82,9 @@ def sweep(count: int, rotations: int, poses: int, lattice: tuple[int, int, int],
     """An imitation whose query is a lattice, the plane grid about the handle, and turns about the vertical.
 
     Returns:
-        As `imitation`, and grid: world points (count, count, 3); rotations: (rotations, 3, 3). With an even number of turns half a turn
-        apart, one or two put the lattice's axes along the grid's, where it can be shared; the others do not.
+        As `imitation`, and grid: world points (count, count, 3); rotations: (rotations, 3, 3). With an even number of
+        turns half a turn apart, one or two put the lattice's axes along the grid's, where it can be shared; the others
+        do not.
     """
     arrays = imitation(1, poses, 1)
     grid = plane(count, pitch, arrays["new"])

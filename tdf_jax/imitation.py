@@ -41,8 +41,9 @@ def imitate(
 ) -> Result:
     """Imitate a demonstrated trajectory on a new object of the same category.
 
-    By default the pick is found by descriptors, and the demonstration is carried from there to the goal. With `config=SolveConfig()` or `OptimizeConfig()`
-    the paper's energy, eq. 3, is minimised over all waypoints, by Gauss-Newton steps or by Adam (docs/benchmark.md compares them).
+    By default the pick is found by descriptors, and the demonstration is carried from there to the goal. With
+    `config=SolveConfig()` or `OptimizeConfig()` the paper's energy, eq. 3, is minimised over all waypoints, by
+    Gauss-Newton steps or by Adam (docs/benchmark.md compares them).
 
     Clouds denser than the network's training clouds are thinned, see `encode`.
 
@@ -51,17 +52,21 @@ def imitate(
         demonstration: one, several with the same query points, or a `Reference` from `describe` to share between calls.
         points: the new object's cloud, (points, 3), metres, world frame.
         key: random key, such as `jax.random.key(0)`; the result is a function of it.
-        goal: last pose, T_world_query as `wxyz_xyz`; by default, if it is kept, the demonstration's last pose, carried by the centroids.
+        goal: last pose, T_world_query as `wxyz_xyz`; by default, if it is kept, the demonstration's last pose, carried
+            by the centroids.
         goal_offset: world vector added to the goal's translation, metres.
-        fix_last: keep the last pose at the goal. Without, such as for the one pose of a grasp, the demonstration is carried rigidly with the pick; or, with other configs, all
-            poses are found alike, and a goal is where the last one starts.
+        fix_last: keep the last pose at the goal. Without, such as for the one pose of a grasp, the demonstration is
+            carried rigidly with the pick; or, with other configs, all poses are found alike, and a goal is where the
+            last one starts.
         energy: weights of eq. 3's terms, by default the paper's; only with a `config` that minimises it.
-        config: settings of `carry`; or of `solve`; or, for Adam as in the paper and for energies with eq. 6, of `optimize`.
+        config: settings of `carry`; or of `solve`; or, for Adam as in the paper and for energies with eq. 6, of
+            `optimize`.
         progress, mesh: see `solve` and `optimize`.
 
     Returns:
-        The result; `.trajectory` is the best one, T_world_query. A `CategoryWarning` is issued if the object is more likely of another category than the demonstration's, where that is
-        known: for shipped weights, and the default config.
+        The result; `.trajectory` is the best one, T_world_query. A `CategoryWarning` is issued if the object is more
+        likely of another category than the demonstration's, where that is known: for shipped weights, and the default
+        config.
 
     Raises:
         InputError: bad points, goal, offset or settings, or an energy that `carry` would not use.
@@ -108,8 +113,8 @@ def imitate_batch(
 ) -> list[Result]:
     """Imitate on many new objects with one compiled program.
 
-    The demonstration is encoded once. Targets run one after the other: one target's starts already fill the machine, and
-    memory does not grow with the number of targets.
+    The demonstration is encoded once. Targets run one after the other: one target's starts already fill the machine,
+    and memory does not grow with the number of targets.
 
     Args:
         model, demonstration: as for `imitate`.

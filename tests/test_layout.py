@@ -63,7 +63,8 @@ def imported(path: Path) -> set[str]:
 @pytest.mark.parametrize("path", FILES, ids=str)
 def test_a_module_imports_only_what_the_table_allows(path):
     assert room(path) in MAY_IMPORT, f"say in MAY_IMPORT what {path} may import"
-    extra = {""} if room(path) == "cli" else set()  # the package itself imports most modules, so only the last may import it
+    # the package itself imports most modules, so only the last may import it
+    extra = {""} if room(path) == "cli" else set()
     assert imported(path) <= allowed(room(path)) | extra
 
 

@@ -9,7 +9,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from tdf_jax._internal.errors import InputError
 
 WHOLE = PartitionSpec()
-# Descriptors held at a time on an accelerator: 134 MB, and as much again for every tangent. An estimate: enough to fill it, few enough for its memory.
+# Descriptors held at a time on an accelerator: 134 MB, and as much again for every tangent. An estimate: enough to fill
+# it, few enough for its memory.
 ACCELERATOR_POINTS = 16384
 
 ONCE = {"xla_backend_optimization_level": 0}  # for programs that run once a call: half the time to compile

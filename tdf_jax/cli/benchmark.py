@@ -28,7 +28,8 @@ def benchmark(
 ) -> None:
     """Imitate whole trajectories on unseen mugs, goals displaced up to the opposite direction, and measure every method against the truth.
 
-    Writes benchmark.md, benchmark.json and pictures. Interrupted and run again, also with more pairs, clouds or methods, it does only what is missing.
+    Writes benchmark.md, benchmark.json and pictures. Interrupted and run again, also with more pairs, clouds or
+    methods, it does only what is missing.
 
     Args:
         weights: a name of shipped weights, or a .safetensors file.

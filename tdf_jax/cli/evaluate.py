@@ -44,12 +44,13 @@ def evaluate(
         category: mug, bowl, bottle; several are evaluated one after the other.
         pairs: generated pairs of each category; 0 for none, beside --meshes.
         seed: of the objects, poses, query points and starts.
-        size: of generated objects, metres: a mug's height, the diagonal of others; a real one keeps its size, and is demonstrated on a generated one of that.
+        size: of generated objects, metres: a mug's height, the diagonal of others; a real one keeps its size, and is
+            demonstrated on a generated one of that.
         place: of a mug the handle, rim or base; of a bowl the rim, base or body; of a bottle the neck, base or body.
         inits: random starts of each transfer; the one with the least loss counts.
         iterations: Adam steps.
-        clouds: the new object's cloud: full; from 1, 2 or 4 cameras; of 300 to 3000 points; 300 with 2 mm noise; half or
-            double size.
+        clouds: the new object's cloud: full; from 1, 2 or 4 cameras; of 300 to 3000 points; 300 with 2 mm noise; half
+            or double size.
         baselines: also random weights, alignment of principal axes and ICP, on the same cases with as many starts.
         meshes: folder of real objects of these categories and their meshes.json; see docs/evaluation.md.
         poses: random poses of each real object.

@@ -47,8 +47,8 @@ ROUTED = 1_000_000  # points of a grid at most for the lowest-cost path, by esti
 def landscape(settings: Annotated[LandscapeSettings, tyro.conf.arg(name="")] = LandscapeSettings()) -> None:
     """Sweep the query frame over a grid: where does each waypoint's descriptor find its like?
 
-    Writes a folder with result.json, landscape.npz, pictures and a page to turn by hand. A sweep that is interrupted is kept beside it and
-    goes on when the same command is run again.
+    Writes a folder with result.json, landscape.npz, pictures and a page to turn by hand. A sweep that is interrupted is
+    kept beside it and goes on when the same command is run again.
     """
     settings = resolved(settings)
     began = time.perf_counter()

@@ -11,7 +11,8 @@ import tyro
 from tdf_jax._internal.errors import InputError
 
 MEMORY = "error: out of memory; lower the number of starts, poses, query points or points, or raise the pitch"
-COMMANDS = ("imitate", "landscape", "convert", "evaluate", "benchmark", "shapes", "dataset", "train", "reproduce")  # each is a function in the module of its name
+# each is a function in the module of its name
+COMMANDS = ("imitate", "landscape", "convert", "evaluate", "benchmark", "shapes", "dataset", "train", "reproduce")
 STYLE = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)  # `--json` without `--no-json`, no word for "not given"
 
 

@@ -39,7 +39,8 @@ class SceneSettings:
         target_pose: how the target lies in the world: as its file says, or moved by a random rotation and translation.
         demonstration: .npz with points (N, 3), wxyz_xyz (n, 7) and query (Q, 3), in metres.
         category: of generated objects.
-        trajectory: shape of a generated demonstration, from a mug's handle, a bowl's rim or a bottle's neck to a place 0.30 m away; lift_over sets it down on a shelf there.
+        trajectory: shape of a generated demonstration, from a mug's handle, a bowl's rim or a bottle's neck to a place
+            0.30 m away; lift_over sets it down on a shelf there.
         poses: of the trajectory; a demonstration file is resampled to another number.
         queries: query points of a generated demonstration.
         points: drawn from a mesh, or from a larger cloud.
@@ -69,7 +70,8 @@ class Settings(SceneSettings):
     Attributes:
         goal_offset: metres in the world, added to where the last pose goes.
         k: weight of the correlation term of eq. 3, for the methods that minimise it; the paper's best is 0.02.
-        method: carry the demonstration from the pick to the goal; or minimise the paper's energy, eq. 3, by damped Gauss-Newton steps, or by Adam's as the paper does.
+        method: carry the demonstration from the pick to the goal; or minimise the paper's energy, eq. 3, by damped
+            Gauss-Newton steps, or by Adam's as the paper does.
         inits: random starts.
         iterations: Adam's steps.
         out: folder to write; an earlier result there is replaced.
@@ -95,18 +97,19 @@ class LandscapeSettings(SceneSettings):
 
     Attributes:
         target_pose: as its file says, or moved by a random rotation and translation.
-        grid: a plane through the middle of the demonstration's path, a volume about it, or the path's neighbourhood; along the axes of the
-            orientation, or of the world where there are many.
+        grid: a plane through the middle of the demonstration's path, a volume about it, or the path's neighbourhood;
+            along the axes of the orientation, or of the world where there are many.
         half: of the plane's or volume's side, metres.
         radius: of the neighbourhood of a path, metres.
         pitch: distance of neighbouring points, metres; the side is rounded to whole ones.
-        query: a lattice of the grid's pitch in the box of the demonstration's query points, or those points moved onto it, or as they
-            are: some thirty times slower in one orientation; with many, a lattice would save nothing.
-        rotation: of the query frame: the demonstration's at the pick, the world's axes (as in the paper), the best of many at every
-            point, or the pick's turned about an axis, the best at every point.
+        query: a lattice of the grid's pitch in the box of the demonstration's query points, or those points moved onto
+            it, or as they are: some thirty times slower in one orientation; with many, a lattice would save nothing.
+        rotation: of the query frame: the demonstration's at the pick, the world's axes (as in the paper), the best of
+            many at every point, or the pick's turned about an axis, the best at every point.
         rotations: number of them for "best" and "turns".
         axis: of "turns", in the world.
-        reduce: how the waypoints' energies are combined: the least, a soft least, each in its ring about the pick, or the mean.
+        reduce: how the waypoints' energies are combined: the least, a soft least, each in its ring about the pick, or
+            the mean.
         sharpness: of the lowest-cost path from the pick to the goal: power of the energy that it adds up.
         no_page: leave out landscape.html.
         out: folder to write; an earlier result there is replaced.

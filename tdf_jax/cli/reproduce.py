@@ -45,8 +45,8 @@ def reproduce(
     Args:
         experiment: which one.
         out: folder for the pictures and tables; what was computed is kept in its folder runs.
-        fast: fewer seeds and grid points, and fewer starts, iterations and query points where those are not set: a look at everything
-            in minutes.
+        fast: fewer seeds and grid points, and fewer starts, iterations and query points where those are not set: a look
+            at everything in minutes.
         weights: a name of shipped weights, or a .safetensors file.
         setting: what all experiments start from; each changes what it is about.
     """

@@ -39,7 +39,8 @@ def train(
     Args:
         out: folder of the run: its settings, metrics, curves and checkpoint.
         data: folder made by tdf dataset; several for one network of several categories.
-        start_from: a name of shipped weights or a .safetensors file to go on from, with their asymmetry unless --network.asymmetry is another one than 0; --learning-rate 0.003 suits it.
+        start_from: a name of shipped weights or a .safetensors file to go on from, with their asymmetry unless
+            --network.asymmetry is another one than 0; --learning-rate 0.003 suits it.
         minutes: choose --steps so that the run takes about so long on this machine.
         weights: .safetensors file to write at the end.
         workers: processes that draw the samples of the steps to come.

@@ -1,7 +1,7 @@
 """Energies of one trajectory: how far it is from the demonstration's (eq. 2, 3 and 6 of the TDF paper).
 
-Each function takes one trajectory; batches are made outside. The energy is a mean over poses of terms of one pose each, plus
-eq. 6, which couples neighbours: `optimize` uses that to hold one chunk of descriptors at a time.
+Each function takes one trajectory; batches are made outside. The energy is a mean over poses of terms of one pose each,
+plus eq. 6, which couples neighbours: `optimize` uses that to hold one chunk of descriptors at a time.
 """
 
 import dataclasses
@@ -32,10 +32,12 @@ class EnergyWeights:
     Attributes:
         correlation: k of eq. 3; the paper's best is 0.02.
         compensator: weight of eq. 6, which the paper tried and rejected.
-        lever: metres that a turn of one unit counts as in eq. 3, where the paper does not say. At 1 m, the plain norm, a turn outweighs the
-            descriptors of a real, 0.1 m mug by far, and a mug that lies in another orientation is not followed (docs/energy.md).
-        pose_norm: the norm of eq. 3, which the paper does not specify: "frobenius", of the difference of the 4x4 matrices,
-            "metres_radians", sqrt(distance^2 + angle^2), or "mean_absolute", over the twelve numbers of (R, t), as eq. 2 is over channels.
+        lever: metres that a turn of one unit counts as in eq. 3, where the paper does not say. At 1 m, the plain norm,
+            a turn outweighs the descriptors of a real, 0.1 m mug by far, and a mug that lies in another orientation is
+            not followed (docs/energy.md).
+        pose_norm: the norm of eq. 3, which the paper does not specify: "frobenius", of the difference of the 4x4
+            matrices, "metres_radians", sqrt(distance^2 + angle^2), or "mean_absolute", over the twelve numbers of (R,
+            t), as eq. 2 is over channels.
         compensator_order: of eq. 6, see `compensator_loss`.
 
     Raises:
@@ -108,8 +110,8 @@ def pose_energy(
     """What the energy adds to eq. 2: the weighted terms that depend on the poses alone.
 
     Args:
-        R, t: poses of the query frame in the world; matrices, for the optimiser has them: by way of quaternions it took 10.6
-            instead of 6.3 s of CPU to compile.
+        R, t: poses of the query frame in the world; matrices, for the optimiser has them: by way of quaternions it took
+            10.6 instead of 6.3 s of CPU to compile.
         origin: centroid of the new object's cloud, metres, world frame.
         reference: the demonstration's.
         weights: of the terms.

@@ -41,14 +41,16 @@ def describe(model: Model, demonstrations: Demonstration | Sequence[Demonstratio
     Args:
         model: the network.
         demonstrations: one, or several with the same query points and number of poses.
-        combine: what is taken of several descriptors of a query point, channel by channel: their "mean", as in NDF, or their "median", which has the least sum of the absolute
-            differences that eq. 2 counts (docs/benchmark.md compares).
+        combine: what is taken of several descriptors of a query point, channel by channel: their "mean", as in NDF, or
+            their "median", which has the least sum of the absolute differences that eq. 2 counts (docs/benchmark.md
+            compares).
 
     Returns:
         The reference.
 
     Raises:
-        InputError: no demonstration, something else, demonstrations that differ in query points or number of poses, or an unknown combination.
+        InputError: no demonstration, something else, demonstrations that differ in query points or number of poses, or
+            an unknown combination.
     """
     if combine not in COMBINATIONS:
         raise InputError(f"describe(): combine is {combine!r}; expected one of {', '.join(COMBINATIONS)}")

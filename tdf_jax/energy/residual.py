@@ -7,7 +7,8 @@ from jaxtyping import Array, Float
 def pick_residual(energy: float, descriptors: Float[Array, "queries channels"]) -> float:
     """Energy of a pick over what it would be if all query points had the demonstration's mean descriptor.
 
-    A number without a unit, 0 for a perfect match: networks and query points differ in how far their descriptors are apart, less in this ratio.
+    A number without a unit, 0 for a perfect match: networks and query points differ in how far their descriptors are
+    apart, less in this ratio.
 
     Args:
         energy: of descriptors alone (eq. 2 of one waypoint).

@@ -7,9 +7,11 @@ A folder of meshes holds one `meshes.json`, an object with an entry for each mes
      "bowl.obj": {"category": "bowl", "unit": 1, "up": "+z", "symmetry": "round"},
      "mustard.obj": {"category": "bottle", "unit": 1, "up": "+z", "symmetry": "two-fold", "front": "+x"}}
 
-`unit` is metres per unit of the file; `up` and `handle` are axes of the file. Bowls and bottles have a `symmetry`, one of `tdf_jax.geometry.symmetry.FOLDS`, and, unless
-they are round, a `front`: the axis of the file, or a direction [x, y, z] in it, along their longer side or to their handle. `places` are frames T_object_place,
-4x4 in metres, in the canonical frame (z up, the handle or front along +x, the origin on the body's axis at mid height); those not given are measured.
+`unit` is metres per unit of the file; `up` and `handle` are axes of the file. Bowls and bottles have a `symmetry`, one
+of `tdf_jax.geometry.symmetry.FOLDS`, and, unless they are round, a `front`: the axis of the file, or a direction [x, y,
+z] in it, along their longer side or to their handle. `places` are frames T_object_place, 4x4 in metres, in the
+canonical frame (z up, the handle or front along +x, the origin on the body's axis at mid height); those not given are
+measured.
 """
 
 import dataclasses
@@ -73,8 +75,8 @@ def load_annotated(folder: str | Path) -> list[AnnotatedMesh]:
     """Read the meshes that a folder's `meshes.json` names, in the order of their names.
 
     Raises:
-        InputError: the folder or the sidecar is missing, an entry is malformed or names a mesh that cannot be used, or a mesh
-            lies in the folder without an entry.
+        InputError: the folder or the sidecar is missing, an entry is malformed or names a mesh that cannot be used, or
+            a mesh lies in the folder without an entry.
     """
     folder = Path(folder)
     entries = _sidecar(folder)

@@ -1,7 +1,8 @@
 """Semantic places of bowls' and bottles' meshes, measured on sections through their axis.
 
-They are those of `tdf_jax.shapes.Bowl` and `tdf_jax.shapes.Bottle`: the canonical frame's origin on the axis at half the height, z up, the front along +x, and
-frames T_object_place of a bowl's rim, base and body and of a bottle's neck, base and body. Surfaces may be open: nothing is asked of the inside.
+They are those of `tdf_jax.shapes.Bowl` and `tdf_jax.shapes.Bottle`: the canonical frame's origin on the axis at half
+the height, z up, the front along +x, and frames T_object_place of a bowl's rim, base and body and of a bottle's neck,
+base and body. Surfaces may be open: nothing is asked of the inside.
 """
 
 import dataclasses
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
 DIRECTIONS = 48  # half planes about the axis, a multiple of 8
 LEVELS = 400  # 0.5 mm apart on a common bottle
 AXIS_LEVELS = 50
-# Where the middle of an object without symmetry is its axis, shares of the height: a bottle's cap is above all handles, a bowl's lower half below all spouts.
+# Where the middle of an object without symmetry is its axis, shares of the height: a bottle's cap is above all handles,
+# a bowl's lower half below all spouts.
 AXIS_FROM = {"bowl": (0.1, 0.5), "bottle": (0.9, 1.0)}
 TURNS = {ROUND: (1 / 8, 1 / 4), 2: (1 / 2,), 4: (1 / 4,)}  # of a full one, that leave an outline as it is
 CHANGE = 0.15  # of the radius: by how much a turn may change it still
@@ -29,7 +31,8 @@ LEAST_FRONT = 0.9  # of the reach to the other sides: less of a reach is not to 
 SHAPELESS = 0.02  # strength of an outline's harmonic below which it has no direction: an ellipse 4 % longer than wide
 NARROWER = 0.9  # of the body's radius: the widest neck that is one
 CURVES = np.linspace(1.0, 3.0, 17)  # of the shoulders tried, `BottleParameters.shoulder_curve`
-LOWEST_SHOULDER = 0.5  # of the height of the shoulder's middle: where it may begin; lower, barrels are taken for shoulders
+# of the height of the shoulder's middle: where it may begin; lower, barrels are taken for shoulders
+LOWEST_SHOULDER = 0.5
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -39,10 +42,12 @@ class Profile:
     Attributes:
         origin: on the axis at half the height, in the frame it was measured in, (3,), metres.
         height: metres.
-        sections: for each direction, evenly about the axis from +x on, the surface in the plane through the axis: segments (segments, 2, 2) of (distance
-            from the axis that way, height above the origin), metres.
-        radii: the outermost surface by level, upwards, and direction, metres; a hole is as wide as what is above and below it, NaN if it is all of the height.
-        turned: from +x to the longer side, or to the nearest flat side of a square, radians; 0 where symmetry or shape tell of none.
+        sections: for each direction, evenly about the axis from +x on, the surface in the plane through the axis:
+            segments (segments, 2, 2) of (distance from the axis that way, height above the origin), metres.
+        radii: the outermost surface by level, upwards, and direction, metres; a hole is as wide as what is above and
+            below it, NaN if it is all of the height.
+        turned: from +x to the longer side, or to the nearest flat side of a square, radians; 0 where symmetry or shape
+            tell of none.
     """
 
     origin: Float[np.ndarray, "3"]
@@ -97,7 +102,8 @@ def profile_places(found: Profile, category: str, fold: int, name: str, places: 
         T_object_place, 4x4, metres, by the names of `tdf_jax.shapes.FAMILIES`.
 
     Raises:
-        InputError: the mesh is not an open bowl with a wall, or not a bottle with a neck on a body, where a place to be measured needs it.
+        InputError: the mesh is not an open bowl with a wall, or not a bottle with a neck on a body, where a place to be
+            measured needs it.
     """
     half = found.height / 2
     frames = {"base": frame(0.0, -half)}
@@ -122,8 +128,9 @@ def _axis(mesh, shares: tuple[float, float], name: str) -> np.ndarray:
     low, high = mesh.bounds[:, 2]
     levels = low + (high - low) * (shares[0] + (shares[1] - shares[0]) * (np.arange(AXIS_LEVELS) + 0.5) / AXIS_LEVELS)
     cuts = (mesh_plane(mesh, plane_normal=[0, 0, 1], plane_origin=[0, 0, level])[..., :2].reshape(-1, 2) for level in levels)
-    # The middle of an outline is its axis for every symmetry, while the mean of its points follows how densely a side was scanned; the middle of the whole
-    # box is thrown off by one stray vertex, and of a scanned bowl by 0.4 mm by its leaning rim.
+    # The middle of an outline is its axis for every symmetry, while the mean of its points follows how densely a side
+    # was scanned; the middle of the whole box is thrown off by one stray vertex, and of a scanned bowl by 0.4 mm by its
+    # leaning rim.
     middles = [(cut.min(axis=0) + cut.max(axis=0)) / 2 for cut in cuts if len(cut)]
     if not middles:
         raise InputError(
@@ -173,7 +180,8 @@ def _check_symmetry(around: np.ndarray, bounds: np.ndarray, fold: int, name: str
                 "or longer side at the front; correct 'front' and 'up'"
             )
         return
-    changes = [np.nanquantile(np.abs(around - np.roll(around, round(turn * DIRECTIONS))), 0.9) for turn in TURNS[fold]]  # lugs aside
+    # lugs aside
+    changes = [np.nanquantile(np.abs(around - np.roll(around, round(turn * DIRECTIONS))), 0.9) for turn in TURNS[fold]]
     if max(changes) > CHANGE:
         raise InputError(
             f"profile(): {name} is not {FOLDS[fold]}: a turn of {360 * TURNS[fold][np.argmax(changes)]:g} degrees about 'up' changes its outline by "
@@ -186,7 +194,8 @@ def _turned(around: np.ndarray, fold: int) -> float:
         return 0.0
     angles = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
     harmonic = np.nansum(around**2 * np.exp(1j * fold * angles)) / np.nansum(around**2)
-    # The second harmonic is largest along the longer side; the fourth along a square's corners, which lie beside its sides.
+    # The second harmonic is largest along the longer side; the fourth along a square's corners, which lie beside its
+    # sides.
     return float(np.angle(harmonic if fold == 2 else -harmonic)) / fold if abs(harmonic) > SHAPELESS else 0.0
 
 
@@ -197,7 +206,8 @@ def _rim(found: Profile, fold: int, name: str) -> float:
     middles = []
     for section in found.sections[:: 1 if fold == ROUND else DIRECTIONS // fold]:
         side = section[(section[..., 0] > 0).all(axis=1)]
-        wall = crossings(side, side[..., 1].max(initial=-np.inf) - BELOW_RIM * found.height)  # below the top on this side: a rim may lean
+        # below the top on this side: a rim may lean
+        wall = crossings(side, side[..., 1].max(initial=-np.inf) - BELOW_RIM * found.height)
         if len(wall) > 1:
             middles.append(wall[-2:].mean())
     if not middles:
@@ -214,7 +224,8 @@ def _bottle_levels(found: Profile, fold: int, name: str) -> tuple[float, float]:
     levels = _levels(height) + height / 2
     body = float(np.quantile(radius[: LEVELS // 2], 0.9))  # not the greatest: a seam; not the median: a waist
     neck = float(np.quantile(radius[LEVELS // 2 :], 0.2))
-    for _ in range(4):  # the neck is what is above the shoulder's middle, which is half way between body and neck; settles after two
+    # the neck is what is above the shoulder's middle, which is half way between body and neck; settles after two
+    for _ in range(4):
         below = (radius < (body + neck) / 2) & (np.arange(LEVELS) > np.argmax(radius[: LEVELS // 2]))
         if neck > NARROWER * body or not below.any():
             raise _unmeasured(name, "nothing above its body is narrow enough for a neck; is 'up' right?", wanted)
@@ -240,13 +251,15 @@ def _mean_radius(found: Profile, fold: int) -> np.ndarray:
 def _shoulder_from(levels: np.ndarray, radius: np.ndarray, half_way: float, neck: float, height: float) -> float:
     """Level above the base where the body ends.
 
-    Of the shoulders of `BottleParameters` that are half as wide at `half_way`, on bodies with any bulge, the one that fits best up to there. The highest level
-    with 95 % of the body's radius was tried: it is in the middle of a dome, up to 46 mm too high on a bottle of 0.27 m.
+    Of the shoulders of `BottleParameters` that are half as wide at `half_way`, on bodies with any bulge, the one that
+    fits best up to there. The highest level with 95 % of the body's radius was tried: it is in the middle of a dome, up
+    to 46 mm too high on a bottle of 0.27 m.
     """
     best, level = np.inf, half_way
     start = np.arange(LOWEST_SHOULDER * half_way, half_way, 0.0025 * height)[:, None]
     bulge = 4 * np.minimum(levels / start, 1) * (1 - np.minimum(levels / start, 1))
-    shoulders = [(curve, (1 - 0.5**curve) ** (1 / curve)) for curve in CURVES] + [(None, 0.5)]  # None: a slope; with its share below half_way
+    # None: a slope; with its share below half_way
+    shoulders = [(curve, (1 - 0.5**curve) ** (1 / curve)) for curve in CURVES] + [(None, 0.5)]
     for curve, middle in shoulders:
         share = middle * np.maximum(levels - start, 0) / (half_way - start)
         wide = (1 + np.cos(np.pi * share)) / 2 if curve is None else np.maximum(1 - share**curve, 0) ** (1 / curve)

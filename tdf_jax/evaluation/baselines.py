@@ -1,7 +1,7 @@
 """What the network has to beat: rigid alignment of the two clouds, which needs no training.
 
-A baseline finds T_b_a, the motion of object a in its canonical frame onto object b's cloud in the world, and carries the place's
-pose by it. Both objects are mugs of one height, but not the same mug: even the best motion leaves an error.
+A baseline finds T_b_a, the motion of object a in its canonical frame onto object b's cloud in the world, and carries
+the place's pose by it. Both objects are mugs of one height, but not the same mug: even the best motion leaves an error.
 """
 
 from collections.abc import Sequence

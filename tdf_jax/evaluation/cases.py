@@ -15,7 +15,8 @@ from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.shapes import FAMILIES, Mug, Shape, scaled
 
 SEED_SPACE = 7_000_001  # keeps evaluation objects apart from training's, which are drawn from [seed, index]
-# Folded into the key of random poses: start m of a seed is drawn from fold_in(key(seed), m), and must not be the true rotation.
+# Folded into the key of random poses: start m of a seed is drawn from fold_in(key(seed), m), and must not be the true
+# rotation.
 POSE_STREAM = 0x7D05E
 
 

@@ -26,7 +26,8 @@ from tdf_jax.networks.model import Model, fingerprint
 from tdf_jax.solvers.pick import carry
 
 FORMAT = 1  # of what is kept
-MUGS, MOST = 1_000_000_000, 100  # demonstrated mugs are numbered from here, apart from those of the tasks; so many a task
+# demonstrated mugs are numbered from here, apart from those of the tasks; so many a task
+MUGS, MOST = 1_000_000_000, 100
 POINTS = 1500
 
 

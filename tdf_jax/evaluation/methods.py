@@ -1,7 +1,8 @@
 """What imitates a task: the library, the paper's energy, and baselines from copying to an oracle.
 
-A method's rows are its starts (of the solver: the candidates it ends with), each a whole trajectory that ends at the goal, with a score that its best is chosen by.
-Methods that find one motion of the object carry the demonstration as the library does (`tdf_jax.geometry.transport.carry_trajectory`), unless their name says otherwise.
+A method's rows are its starts (of the solver: the candidates it ends with), each a whole trajectory that ends at the
+goal, with a score that its best is chosen by. Methods that find one motion of the object carry the demonstration as the
+library does (`tdf_jax.geometry.transport.carry_trajectory`), unless their name says otherwise.
 """
 
 import dataclasses
@@ -34,7 +35,8 @@ from tdf_jax.solvers.result import Result
 LIBRARY = "tdf_jax"
 NEAR = 0.04  # metres from the pick within which the oracle's correspondences count
 MANY = 64  # starts of the baselines that are tried with as many as the library's solver scouts from
-PAPER = {  # eq. 3; the paper leaves the norm open, and all but the plain one are with the library's lever, which helps it
+# eq. 3; the paper leaves the norm open, and all but the plain one are with the library's lever, which helps it
+PAPER = {
     "TDF, k = 0": EnergyWeights(0.0),
     "TDF, k = 0.02": EnergyWeights(0.02),
     "TDF, k = 0.2": EnergyWeights(0.2),
@@ -231,8 +233,10 @@ METHODS: dict[str, Callable] = {
     LIBRARY: _library,
     "oracle correspondences": _oracle,
 }
-NETWORKS = (*(name for name in METHODS if name.startswith("NDF")), *PAPER, COMPENSATED, *ABOUT_CARRIED, LIBRARY)  # those that use the network's descriptors
-# Variants are tried on every fifth task, which are of all paths with all goals too: all of them would take as long as the rest together.
+# those that use the network's descriptors
+NETWORKS = (*(name for name in METHODS if name.startswith("NDF")), *PAPER, COMPENSATED, *ABOUT_CARRIED, LIBRARY)
+# Variants are tried on every fifth task, which are of all paths with all goals too: all of them would take as long as
+# the rest together.
 VARIANTS = (*(name for name in METHODS if f"{MANY} starts" in name), "random weights", *(name for name in PAPER if name != "TDF, k = 0.02"), COMPENSATED, *ABOUT_CARRIED)
 EVERY = 5
 

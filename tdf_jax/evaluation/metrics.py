@@ -23,8 +23,9 @@ def expected_trajectory(
 ) -> Trajectory:
     """The demonstrated trajectory as it ought to be on another object.
 
-    With A the motion of the semantic place (say, the handle) from object a to object b, the first pose becomes A T_0 and the last the goal; between them
-    the demonstration is carried as `carry_trajectory` says. It is a definition: where object and goal moved differently, no way between them is the only right one.
+    With A the motion of the semantic place (say, the handle) from object a to object b, the first pose becomes A T_0
+    and the last the goal; between them the demonstration is carried as `carry_trajectory` says. It is a definition:
+    where object and goal moved differently, no way between them is the only right one.
 
     Args:
         demonstrated: T_world_query on object a.

@@ -25,12 +25,14 @@ class Score:
     Attributes:
         method, task, instance, path, displacement, clouds: what was tried on what.
         distances, angles: of the selected trajectory's waypoints.
-        best_pick: distance and angle of the start whose pick is nearest to the truth (the sum of both over 1 cm and 10 degrees).
+        best_pick: distance and angle of the start whose pick is nearest to the truth (the sum of both over 1 cm and 10
+            degrees).
         best_path: mean distance of waypoints of the start whose path is nearest to the truth.
         frechet: discrete Frechet distance to the expected path.
         jerk: of the path, over the expected path's, which is taken as 0.1 mm if it is less.
         longest_step: over the mean step; the expected path's is in `expected_step`.
-        penetration: share of query points in the object's clay more than on the expected path; None where the object has no inside.
+        penetration: share of query points in the object's clay more than on the expected path; None where the object
+            has no inside.
         starts: how many there were.
         seconds: of the attempt.
         confidence: of the method that the pick is right; None where it has none.
@@ -67,7 +69,8 @@ class Score:
 
 def score(method: str, attempt: Attempt, task: Task) -> Score:
     """Measure an attempt against a task's truth."""
-    # What is not finite counts as the demonstration where it was shown; a row like that is not chosen while another is finite.
+    # What is not finite counts as the demonstration where it was shown; a row like that is not chosen while another is
+    # finite.
     shown = np.asarray(task.demonstration.trajectory.wxyz_xyz)
     trajectories = np.where(attempt.finite[:, None, None], attempt.trajectories, shown)
     distance, angle = pose_error(trajectories, task.expected.wxyz_xyz)

@@ -18,7 +18,8 @@ from tdf_jax.geometry.paths import PATHS
 from tdf_jax.geometry.query import box_query
 from tdf_jax.geometry.trajectory import Trajectory
 
-# How far the goal is moved from the demonstration's last pose carried by the centroids; "opposite" is as far behind the carried pick as that lies ahead of it.
+# How far the goal is moved from the demonstration's last pose carried by the centroids; "opposite" is as far behind the
+# carried pick as that lies ahead of it.
 DISPLACEMENTS = {"none": 0.0, "10 cm": 0.1, "30 cm": 0.3, "opposite": None}
 POSES = 7
 MESHES = 24_000_000  # tasks on real meshes are numbered from here

@@ -90,8 +90,8 @@ def overlaps(model: Model, cases: Sequence[Case], samples: int = 20_000, seed: i
         seed: of the points.
 
     Returns:
-        One number a case as the field was encoded, "iou", and one after `refine`, "iou_refined"; None where object b's mesh is not closed and
-        has no volume.
+        One number a case as the field was encoded, "iou", and one after `refine`, "iou_refined"; None where object b's
+        mesh is not closed and has no volume.
     """
     rng = np.random.default_rng(seed)
     ious = no_overlaps([])

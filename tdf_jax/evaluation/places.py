@@ -1,7 +1,8 @@
 """Semantic places of a mug's mesh, measured on its section along the plane of symmetry.
 
-They are those of `tdf_jax.shapes.Mug`: the canonical frame's origin on the body's axis at mid height, z up, the handle along
-+x, and frames T_object_place of the handle, the rim and the base. Surfaces may be open: nothing is asked of the inside.
+They are those of `tdf_jax.shapes.Mug`: the canonical frame's origin on the body's axis at mid height, z up, the handle
+along +x, and frames T_object_place of the handle, the rim and the base. Surfaces may be open: nothing is asked of the
+inside.
 """
 
 import dataclasses
@@ -52,7 +53,8 @@ def body(mesh: "trimesh.Trimesh", name: str) -> Body:
     radius, middle = np.ptp(y) / 2, (y.min() + y.max()) / 2
     axis = x.min() + radius
     widest = x[np.abs(y - middle) > 0.995 * radius]  # of a square mug, all along two sides
-    # A handle along -x shifts the axis by its reach, one along y widens the body: both put the widest part off the axis.
+    # A handle along -x shifts the axis by its reach, one along y widens the body: both put the widest part off the
+    # axis.
     if x.max() < axis + 1.1 * radius or abs((widest.min() + widest.max()) / 2 - axis) > OFF_AXIS * radius:
         raise InputError(
             f"body(): {name} has no handle along the axis given as 'handle': it is {100 * np.ptp(x):.1f} cm long that way and "
@@ -68,8 +70,8 @@ def measured_places(
 ) -> dict[str, Float[np.ndarray, "4 4"]]:
     """Frames of the handle, the rim and the base of a mug in its canonical frame.
 
-    The handle's origin is on its centre line, half way between its attachments, on the outermost branch; an attachment is where
-    the centre line of an arm, continued straight, meets the middle of the wall.
+    The handle's origin is on its centre line, half way between its attachments, on the outermost branch; an attachment
+    is where the centre line of an arm, continued straight, meets the middle of the wall.
 
     Args:
         mesh: canonical frame, metres.
@@ -81,7 +83,8 @@ def measured_places(
         T_object_place, 4x4, by the names of `tdf_jax.shapes.Mug.frames`.
 
     Raises:
-        InputError: the mesh is not an open cup, or has no handle with a finger hole, where one of these is to be measured.
+        InputError: the mesh is not an open cup, or has no handle with a finger hole, where one of these is to be
+            measured.
     """
     found = {"base": frame(0.0, -height / 2)}
     if set(places) - set(found):
@@ -139,7 +142,8 @@ def _section(mesh) -> np.ndarray:
     """Line segments (segments, 2, 2) of the surface in the x-z plane."""
     from trimesh.intersections import mesh_plane
 
-    # Beside the plane of symmetry by less than any mesh is accurate: vertices lie in the plane itself, often whole edges.
+    # Beside the plane of symmetry by less than any mesh is accurate: vertices lie in the plane itself, often whole
+    # edges.
     return mesh_plane(mesh, plane_normal=[0, 1, 0], plane_origin=[0, 1e-6, 0])[..., [0, 2]]
 
 

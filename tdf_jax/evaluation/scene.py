@@ -27,7 +27,8 @@ class Scene:
         demonstration: as given or generated.
         points: the target's cloud, (points, 3), metres, world frame.
         T_world_target: how the file's frame, or the generated object's, lies in the world, 4x4.
-        T_world_places: frames of the picked place, such as a mug's handle, on both objects, 4x4; None unless both are generated.
+        T_world_places: frames of the picked place, such as a mug's handle, on both objects, 4x4; None unless both are
+            generated.
         meshes: of both objects, world frame, where they have one.
         fold: symmetry of a generated target about the z axis of its frame, see `tdf_jax.symmetry`.
     """
@@ -44,7 +45,8 @@ class Scene:
 
         Args:
             goal: last pose, T_world_query.
-            pick: first pose that was found: of a symmetric target's true picks, the one nearest to it begins the trajectory.
+            pick: first pose that was found: of a symmetric target's true picks, the one nearest to it begins the
+                trajectory.
         """
         if self.T_world_places is None:
             return None

@@ -31,11 +31,12 @@ def summary(
         ious: by name; None where there is none.
         cases: what the errors are of.
         seed: of the bootstrap.
-        tilt: of the place's upright axis, degrees; of symmetric objects an error of this alone tells who stands right but turned.
+        tilt: of the place's upright axis, degrees; of symmetric objects an error of this alone tells who stands right
+            but turned.
 
     Returns:
-        Plain numbers by name; None for an IoU where no case has one, and for the intervals of a single object. Under "by_symmetry" success rates and IoUs of the objects of
-        each symmetry.
+        Plain numbers by name; None for an IoU where no case has one, and for the intervals of a single object. Under
+        "by_symmetry" success rates and IoUs of the objects of each symmetry.
     """
     share = distance / [case.diagonal for case in cases]
     known = {name: [iou for iou in several if iou is not None] for name, several in ious.items()}

@@ -1,8 +1,8 @@
 """What a motion keeps clear of: signed distances to boxes, meshes, clouds and the object itself, in metres, by JAX.
 
-An obstacle is a frozen dataclass, a pytree of arrays, with a method `distance(x)`: points (..., 3) of the world -> signed distances (...), negative
-inside. Any class of that kind can be one. Boxes are exact; meshes, clouds and fields are tabulated once on a grid, so that in an optimisation a
-point costs eight table entries, whatever the shape is.
+An obstacle is a frozen dataclass, a pytree of arrays, with a method `distance(x)`: points (..., 3) of the world ->
+signed distances (...), negative inside. Any class of that kind can be one. Boxes are exact; meshes, clouds and fields
+are tabulated once on a grid, so that in an optimisation a point costs eight table entries, whatever the shape is.
 """
 
 from collections.abc import Callable
@@ -48,7 +48,8 @@ class Box:
         # R^T (x - t), written out as in `poses.rotate`.
         R, away = se3.rotation(self.T_world_box), x - self.T_world_box[4:]
         place = jnp.stack([sum(R[i, axis] * away[..., i] for i in range(3)) for axis in range(3)], axis=-1)
-        over = jnp.abs(place) - self.size / 2  # jax's derivative of abs at 0 is 1: a point in the middle of a wall leaves by one side
+        # jax's derivative of abs at 0 is 1: a point in the middle of a wall leaves by one side
+        over = jnp.abs(place) - self.size / 2
         deepest = jnp.max(over, axis=-1)
         inside = deepest <= 0
         square = jnp.sum(jnp.maximum(over, 0) ** 2, axis=-1)
@@ -73,7 +74,8 @@ class DistanceGrid:
     def distance(self, x: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
         """Signed distances, metres, interpolated between the eight nodes around a point.
 
-        Outside of the grid: the value at its nearest point and the way to it. That is continuous and no less than the true distance.
+        Outside of the grid: the value at its nearest point and the way to it. That is continuous and no less than the
+        true distance.
 
         Args:
             x: points, metres, world frame.
@@ -131,21 +133,23 @@ def box_obstacle(centre: ArrayLike, size: ArrayLike, rotation: ArrayLike | None 
 def mesh_obstacle(mesh: "trimesh.Trimesh", pitch: float = 0.01, pad: float = 0.05) -> DistanceGrid:
     """A mesh to keep clear of, closed or open.
 
-    Inside is where the winding number is above a half either way, so small holes do not matter, nor which way the faces look; a single sheet has no
-    inside, and a bowl of one sheet holds the part of its hollow that sees less than half of the sky.
-    Between nodes the distance is at most 0.87 pitches too large, in the middle of a sheet or of a wall thinner than a pitch half a pitch.
+    Inside is where the winding number is above a half either way, so small holes do not matter, nor which way the faces
+    look; a single sheet has no inside, and a bowl of one sheet holds the part of its hollow that sees less than half of
+    the sky. Between nodes the distance is at most 0.87 pitches too large, in the middle of a sheet or of a wall thinner
+    than a pitch half a pitch.
 
     Args:
         mesh: The surface, metres, world frame.
-        pitch: Of the grid, metres; a half or less of the thinnest wall that matters, or of the margin that is kept from it.
+        pitch: Of the grid, metres; a half or less of the thinnest wall that matters, or of the margin that is kept from
+            it.
         pad: How far the grid reaches beyond the mesh, metres; more than the margin that is kept.
 
     Returns:
         The obstacle.
 
     Raises:
-        InputError: The mesh has no faces or is not finite, pitch or pad is not above 0, the grid has more than 4 million nodes, or libigl is not
-            installed.
+        InputError: The mesh has no faces or is not finite, pitch or pad is not above 0, the grid has more than 4
+            million nodes, or libigl is not installed.
     """
     igl = libigl("mesh_obstacle()")
     if not (hasattr(mesh, "vertices") and hasattr(mesh, "faces")):
@@ -164,12 +168,13 @@ def mesh_obstacle(mesh: "trimesh.Trimesh", pitch: float = 0.01, pad: float = 0.0
 def cloud_obstacle(points: Float[Array, "points 3"], radius: float = 0.005, pitch: float = 0.005, pad: float = 0.05) -> DistanceGrid:
     """A cloud to keep clear of: a ball about each of its points, all of them counted however many there are.
 
-    The space behind a seen surface is free, as far as a cloud tells. Between nodes the distance is at most 0.87 pitches too large, so with a radius of one
-    pitch, as by default, no point of the cloud is outside.
+    The space behind a seen surface is free, as far as a cloud tells. Between nodes the distance is at most 0.87 pitches
+    too large, so with a radius of one pitch, as by default, no point of the cloud is outside.
 
     Args:
         points: Metres, world frame; at least 21, as for `encode`.
-        radius: Of the balls, metres; half of the distance between neighbouring points or more closes a surface. May be 0.
+        radius: Of the balls, metres; half of the distance between neighbouring points or more closes a surface. May be
+            0.
         pitch: Of the grid, metres.
         pad: How far the grid reaches beyond the points, metres; more than the margin that is kept and the radius.
 
@@ -177,7 +182,8 @@ def cloud_obstacle(points: Float[Array, "points 3"], radius: float = 0.005, pitc
         The obstacle.
 
     Raises:
-        InputError: The points are not a cloud, radius is negative, pitch or pad not above 0, or the grid has more than 4 million nodes.
+        InputError: The points are not a cloud, radius is negative, pitch or pad not above 0, or the grid has more than
+            4 million nodes.
     """
     from scipy.spatial import cKDTree
 

@@ -25,8 +25,8 @@ class Grid:
         mask: which points count; all of them if it is not given.
 
     Raises:
-        InputError: an axis of fewer than two points or of no extent, uneven steps, directions that are not perpendicular unit vectors,
-            or a mask of another shape or with no point.
+        InputError: an axis of fewer than two points or of no extent, uneven steps, directions that are not
+            perpendicular unit vectors, or a mask of another shape or with no point.
     """
 
     origin: Float[np.ndarray, "3"]
@@ -124,7 +124,8 @@ def volume_grid(
         axes: directions of its edges; by default the world's axes.
 
     Raises:
-        InputError: an edge of no length, fewer than two points, an origin that is no point, or axes that are not perpendicular.
+        InputError: an edge of no length, fewer than two points, an origin that is no point, or axes that are not
+            perpendicular.
     """
     steps = _symmetric("volume_grid", half, count)
     return Grid(_point("volume_grid", origin), np.eye(3) if axes is None else np.asarray(axes), (steps, steps, steps))
@@ -163,7 +164,8 @@ def distance_from_polyline(points: Float[np.ndarray, "points 3"], corners: Float
     """Distance of points from the nearest point of the polyline through some corners, metres."""
     points, corners = np.asarray(points, float), np.asarray(corners, float)
     least = np.linalg.norm(points - corners[0], axis=1)
-    for start, step in zip(corners, np.diff(corners, axis=0)):  # one piece at a time: memory does not grow with their number
+    # one piece at a time: memory does not grow with their number
+    for start, step in zip(corners, np.diff(corners, axis=0)):
         along = np.clip((points - start) @ step / max(step @ step, np.finfo(float).tiny), 0, 1)
         least = np.minimum(least, np.linalg.norm(points - start - along[:, None] * step, axis=1))
     return least

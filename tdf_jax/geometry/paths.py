@@ -197,7 +197,8 @@ def hang_on_rack(
         The trajectory.
 
     Raises:
-        InputError: If an argument has a wrong shape or value, start and end are the same place, or the approach is zero or all of the way.
+        InputError: If an argument has a wrong shape or value, start and end are the same place, or the approach is zero
+            or all of the way.
     """
     start, end, R_start, R_end = _ends("hang_on_rack", start, end, rotation, end_rotation)
     approach = checked_vector("hang_on_rack", "approach", approach)

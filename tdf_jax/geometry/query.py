@@ -131,8 +131,8 @@ def snapped_query(
 ) -> Float[Array, "queries 3"]:
     """Query points moved to the nearest nodes of a lattice, so that an energy landscape with steps of one pitch shares its evaluations.
 
-    Each moves by at most half a pitch along each axis; some may coincide, and count as often. What it does to the energies,
-    `tdf_jax.landscape.energy_grid.query_change` tells.
+    Each moves by at most half a pitch along each axis; some may coincide, and count as often. What it does to the
+    energies, `tdf_jax.landscape.energy_grid.query_change` tells.
 
     Args:
         query: points in the query frame, metres.

@@ -22,8 +22,9 @@ def thin(points: Float[np.ndarray, "points 3"], count: int) -> Float[np.ndarray,
 def thinnings(points: Float[np.ndarray, "points 3"], count: int, times: int) -> Float[np.ndarray, "times count 3"]:
     """Several farthest-point thinnings of one cloud: of all its points, then of random parts of it.
 
-    The parts are a function of the number of points. A cloud of less than `2 * count / PART` points is thinned once: a part that is hardly
-    larger than the thinning is no longer spread evenly, and the average of such was worse than the thinning of all.
+    The parts are a function of the number of points. A cloud of less than `2 * count / PART` points is thinned once: a
+    part that is hardly larger than the thinning is no longer spread evenly, and the average of such was worse than the
+    thinning of all.
 
     Args:
         points: Points, metres, more than count.

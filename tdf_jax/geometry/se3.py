@@ -130,9 +130,9 @@ def uniform_rotations(key: PRNGKeyArray, count: int) -> Float[Array, "count 3 3"
 def rotation_grid(count: int) -> Float[np.ndarray, "count 3 3"]:
     """Rotations spread evenly over SO(3): no draw, the same every time.
 
-    A spiral on the quaternions' sphere with irrational turns (super-Fibonacci: Alexa, "Super-Fibonacci Spirals: Fast, Low-Discrepancy Sampling
-    of SO(3)", CVPR 2022). Of 20,000 random rotations the one farthest from the grid
-    was 60 degrees away with a count of 64, 29 with 512 and 13 with 4096; on average they were 30, 15 and 8 away.
+    A spiral on the quaternions' sphere with irrational turns (super-Fibonacci: Alexa, "Super-Fibonacci Spirals: Fast,
+    Low-Discrepancy Sampling of SO(3)", CVPR 2022). Of 20,000 random rotations the one farthest from the grid was 60
+    degrees away with a count of 64, 29 with 512 and 13 with 4096; on average they were 30, 15 and 8 away.
 
     Args:
         count: how many, at least 1.

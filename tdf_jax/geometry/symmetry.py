@@ -1,7 +1,8 @@
 """Objects that look the same from several sides: which of their equivalent poses is meant.
 
-The symmetry of an object about its axis z is its fold: 1 where only a full turn leaves it as it is (a mug), 2 where half a turn does (an oval bowl), 4 for
-quarter turns (a square bottle), and `ROUND`, 0, where any turn does. No cloud tells equivalent poses apart, so no error may depend on which of them was found.
+The symmetry of an object about its axis z is its fold: 1 where only a full turn leaves it as it is (a mug), 2 where
+half a turn does (an oval bowl), 4 for quarter turns (a square bottle), and `ROUND`, 0, where any turn does. No cloud
+tells equivalent poses apart, so no error may depend on which of them was found.
 """
 
 import numpy as np

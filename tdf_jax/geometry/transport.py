@@ -13,9 +13,9 @@ from tdf_jax.geometry.trajectory import Trajectory
 def carry_trajectory(demonstrated: Trajectory, pick: Float[Array, "7"], goal: Float[Array, "7"] | None) -> Trajectory:
     """A demonstration carried by the motions of both of its ends.
 
-    With A the motion of the first pose to the pick and G that of the last pose to the goal, waypoint i of n is moved by B_i at
-    s = i / (n - 1): its rotation is the geodesic from A's to G's at s, and the waypoint is carried to the point at s on the line between where A and
-    where G would carry it. The first pose becomes the pick and the last the goal.
+    With A the motion of the first pose to the pick and G that of the last pose to the goal, waypoint i of n is moved by
+    B_i at s = i / (n - 1): its rotation is the geodesic from A's to G's at s, and the waypoint is carried to the point
+    at s on the line between where A and where G would carry it. The first pose becomes the pick and the last the goal.
 
     Args:
         demonstrated: T_world_query, or in any other frame of the demonstration.

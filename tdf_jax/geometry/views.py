@@ -15,7 +15,8 @@ from tdf_jax.geometry.sampling import sample_surface
 
 PIXELS = 160  # across twice the object's radius: 1.3 mm on a real mug
 OCCLUDERS = 100_000  # points that fill the depth buffer; too few leave gaps through which hidden points show
-TOLERANCE = 0.012  # of the diagonal: a point this far behind the nearest one is hidden; thinner than most walls, 2 mm on a real mug
+# of the diagonal: a point this far behind the nearest one is hidden; thinner than most walls, 2 mm on a real mug
+TOLERANCE = 0.012
 DISTANCE = 3.0  # diagonals from the object's middle to the camera
 
 
@@ -96,8 +97,8 @@ def visible(
 ) -> Bool[np.ndarray, "cameras points"]:
     """Which points of a mesh's surface each camera sees.
 
-    A perspective camera `DISTANCE` diagonals from the middle of the bounding box looks at it. Points in a pixel deeper than its
-    nearest surface point by more than `TOLERANCE` are hidden; no normals are needed, so open meshes will do.
+    A perspective camera `DISTANCE` diagonals from the middle of the bounding box looks at it. Points in a pixel deeper
+    than its nearest surface point by more than `TOLERANCE` are hidden; no normals are needed, so open meshes will do.
 
     Args:
         mesh: the object.

@@ -22,7 +22,8 @@ def inside(mesh: "trimesh.Trimesh", x: Float[np.ndarray, "points 3"]) -> Bool[np
         x: spread over the mesh's bounding box and about it, in its unit.
 
     Returns:
-        True inside; None for an open surface: of the points not clearly outside, more than `MOST_UNDECIDED` are not clearly inside.
+        True inside; None for an open surface: of the points not clearly outside, more than `MOST_UNDECIDED` are not
+        clearly inside.
 
     Raises:
         InputError: libigl is not installed.

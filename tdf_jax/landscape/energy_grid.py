@@ -35,25 +35,28 @@ def energy_landscape(
 ) -> Landscape:
     """Sweep the query frame over a grid.
 
-    A point of the field is evaluated once for all waypoints, and once for all query points that meet there: where the query is a lattice
-    with the grid's steps along the grid's axes (`lattice_query`, `snapped_query`), tens of times less work than one by one. The memory at
-    work does not grow with the grid, only with the references: 8 kB for each query point and waypoint, twice.
+    A point of the field is evaluated once for all waypoints, and once for all query points that meet there: where the
+    query is a lattice with the grid's steps along the grid's axes (`lattice_query`, `snapped_query`), tens of times
+    less work than one by one. The memory at work does not grow with the grid, only with the references: 8 kB for each
+    query point and waypoint, twice.
 
     Args:
         field: the object's.
         reference: the demonstration's; waypoints may be of several.
         grid: positions of the query frame's origin.
-        rotation: orientation R_world_query, or several (rotations, 3, 3), such as `poses.rotation_grid` or `poses.turns` give; by
-            default the world's axes, as in the paper.
+        rotation: orientation R_world_query, or several (rotations, 3, 3), such as `poses.rotation_grid` or
+            `poses.turns` give; by default the world's axes, as in the paper.
         reduce: how waypoints are combined, see `Landscape.combined`.
         over_rotations: of several rotations, keep the "best" at every point and for every waypoint, or "each".
         temperature: of the soft least, in units of the energy.
         share: False evaluates every (grid point, query point) by itself, to compare.
-        mesh: devices to share the grid's tiles, of this process or of several that make the same call; see docs/scaling.md.
+        mesh: devices to share the grid's tiles, of this process or of several that make the same call; see
+            docs/scaling.md.
         progress: called with the number of tiles done and of all.
 
     Raises:
-        InputError: rotations that are none, an unknown choice, a mesh of another type, or a reference from another network than the field.
+        InputError: rotations that are none, an unknown choice, a mesh of another type, or a reference from another
+            network than the field.
     """
     landscape = blank(field, reference, grid, rotation, reduce, over_rotations=over_rotations, temperature=temperature)
     for done, total in fill(landscape, field, reference, share=share, mesh=mesh):

@@ -1,9 +1,10 @@
 """Descriptor losses of a query set carried over a grid, each point of the field evaluated once for all who meet there.
 
-Carried to grid point i, query point j stands at `first + i steps + o_j`. Two query points whose offsets o differ by whole steps of the
-grid stand on the same nodes: they form a layer, whose field is evaluated once on the grid extended by their span. On a lattice of
-6 x 6 x 7 in a plane of the same pitch that leaves 7 layers of 36 query points; points drawn at random are layers of one, and the sweep is
-then the direct one. What remains is the sum of |descriptor - reference| over channels, for every grid point, query point and waypoint.
+Carried to grid point i, query point j stands at `first + i steps + o_j`. Two query points whose offsets o differ by
+whole steps of the grid stand on the same nodes: they form a layer, whose field is evaluated once on the grid extended
+by their span. On a lattice of 6 x 6 x 7 in a plane of the same pitch that leaves 7 layers of 36 query points; points
+drawn at random are layers of one, and the sweep is then the direct one. What remains is the sum of |descriptor -
+reference| over channels, for every grid point, query point and waypoint.
 """
 
 import functools
@@ -22,11 +23,13 @@ from tdf_jax._internal import devices
 from tdf_jax.geometry.grid import Grid
 from tdf_jax.networks.field import DescriptorField
 
-TOGETHER = 2e-5  # of a step: offsets this near to whole steps apart share nodes; float32 rounding of a query is 3e-6 of 12 mm
+# of a step: offsets this near to whole steps apart share nodes; float32 rounding of a query is 3e-6 of 12 mm
+TOGETHER = 2e-5
 NODES = 8192  # of a tile and layer: 67 MB of descriptors
 CHUNK_POINTS = 512  # descriptors evaluated at a time, as in `optimize`
-# Channels added up in one fused loop. Written out one by one, XLA vectorises along the grid's last axis and keeps the sums in registers:
-# 20 to 25 billion differences a second on two AVX-512 cores, where a reduction over the channels runs at 0.2 to 0.6.
+# Channels added up in one fused loop. Written out one by one, XLA vectorises along the grid's last axis and keeps the
+# sums in registers: 20 to 25 billion differences a second on two AVX-512 cores, where a reduction over the channels
+# runs at 0.2 to 0.6.
 UNROLLED = 32
 LANES = 8  # float32 numbers of a vector; tiles' last axis is a multiple
 
@@ -58,7 +61,8 @@ def layers(grid: Grid, offsets: Float[np.ndarray, "queries 3"], share: bool = Tr
     Args:
         grid: whose steps count.
         offsets: of the query points from the query frame's origin, world axes, metres.
-        share: False gives each a layer of its own; so does a query that spans so many steps that sharing would evaluate more.
+        share: False gives each a layer of its own; so does a query that spans so many steps that sharing would evaluate
+            more.
     """
     alone = _grouped(grid, offsets, share=False)
     if not share:
@@ -147,8 +151,8 @@ def swept(
 ) -> Iterator[tuple[Tile, Float[np.ndarray, "poses *tile"]]]:
     """Energies of every waypoint on tiles, in their order.
 
-    As many tiles are computed at a time as the mesh has devices, one on each; no more is held. Of several processes each computes those of its
-    own devices, and all of them get all.
+    As many tiles are computed at a time as the mesh has devices, one on each; no more is held. Of several processes
+    each computes those of its own devices, and all of them get all.
 
     Args:
         field: the object's.
@@ -203,7 +207,8 @@ def _tile(field, references, axes, shifts, first, bases, size, span):
         descriptors = _descriptors(field, places.reshape(-1, 3) + base, blocks * unrolled).reshape(blocks, unrolled, *nodes)
 
         def block(sums, both):
-            # Without the barrier the slice of this block is fused into the loop below, and taken again for every query point.
+            # Without the barrier the slice of this block is fused into the loop below, and taken again for every query
+            # point.
             here, there = jax.lax.optimization_barrier(both)
 
             def query(j, sums):

@@ -18,9 +18,9 @@ def lowest_cost_path(
 ) -> Float[np.ndarray, "corners 3"]:
     """The path from start to goal along which the integral of energy^sharpness over length is least.
 
-    Dijkstra's algorithm (scipy) over the points that count, each joined to all its neighbours, diagonal ones included; a step costs its
-    length times the mean of both ends' energy^sharpness. Memory grows with the points: by estimate 1 kB each.
-    A step of the grid is the resolution, and directions are multiples of 45 degrees.
+    Dijkstra's algorithm (scipy) over the points that count, each joined to all its neighbours, diagonal ones included;
+    a step costs its length times the mean of both ends' energy^sharpness. Memory grows with the points: by estimate 1
+    kB each. A step of the grid is the resolution, and directions are multiples of 45 degrees.
 
     Args:
         landscape: in one orientation, or the best of several.
@@ -31,8 +31,8 @@ def lowest_cost_path(
         Points of the grid from start to goal, metres, world frame.
 
     Raises:
-        InputError: each rotation's energies were kept, an end is no point or lies more than a step outside the grid, the sharpness is
-            not in 0 to 50, or the points that count do not join both ends.
+        InputError: each rotation's energies were kept, an end is no point or lies more than a step outside the grid,
+            the sharpness is not in 0 to 50, or the points that count do not join both ends.
     """
     if landscape.turned is None:
         raise InputError("lowest_cost_path(): the landscape keeps each rotation's energies; expected the best, or one rotation's")

@@ -24,8 +24,8 @@ class Landscape:
 
     Attributes:
         grid: where.
-        values: every waypoint's part of eq. 2 with the query frame's origin at the grid's points: (poses, *grid.shape), the least over
-            `rotations`, or (poses, rotations, *grid.shape) if each was kept.
+        values: every waypoint's part of eq. 2 with the query frame's origin at the grid's points: (poses, *grid.shape),
+            the least over `rotations`, or (poses, rotations, *grid.shape) if each was kept.
         waypoints: the demonstration's positions, its centroid moved to the object's, metres.
         rotations: orientations R_world_query of the sweep, (rotations, 3, 3).
         turned: which rotation has the least energy, as `values`; None if each was kept.
@@ -59,7 +59,8 @@ class Landscape:
 
         - "least": the least of the waypoints' energies.
         - "soft_least": -T log(mean exp(-E_i / T)), T the temperature: between the least and the mean, and smooth.
-        - "assigned": the energy of the waypoint whose distance from the first one is nearest to the point's: rings, as in the paper's
+        - "assigned": the energy of the waypoint whose distance from the first one is nearest to the point's: rings, as
+        in the paper's
           figures.
         - "mean": the mean, eq. 2 of a trajectory whose waypoints all stand there.
         """

@@ -18,16 +18,19 @@ from tdf_jax.networks.occupancy import condition, encode_latent
 CENTRED = 1e-7  # of a cloud's extent: a mean this near zero is float32's rounding
 ROOM = 250  # clouds that are not thinned are filled up to a multiple, which common sizes are already
 THINNINGS = 8  # 16 gain another 0.003 of IoU
-SAME_SIDE = np.pi / 6  # radians; latents of one mug's thinnings are turned against each other by 1 to 2 degrees, those of symmetric objects by 60 to 90 on average
+# radians; latents of one mug's thinnings are turned against each other by 1 to 2 degrees, those of symmetric objects by
+# 60 to 90 on average
+SAME_SIDE = np.pi / 6
 
 
 def encode(model: Model, points: Float[Array, "points 3"], thinnings: int = THINNINGS) -> DescriptorField:
     """Encode an object's point cloud into its descriptor field.
 
-    A network knows clouds of one density (`model.info.cloud_points`): with twice as many points the shipped weights' IoU falls from 0.85 to
-    0.24. A denser cloud is therefore thinned by farthest points, several times, and the latents are averaged: each thinning is another
-    sample of the surface, and eight of them raise the IoU by about 0.03 over one. Where the density is not known, as of converted
-    weights, and where the cloud is no denser, all points are used as they are.
+    A network knows clouds of one density (`model.info.cloud_points`): with twice as many points the shipped weights'
+    IoU falls from 0.85 to 0.24. A denser cloud is therefore thinned by farthest points, several times, and the latents
+    are averaged: each thinning is another sample of the surface, and eight of them raise the IoU by about 0.03 over
+    one. Where the density is not known, as of converted weights, and where the cloud is no denser, all points are used
+    as they are.
 
     Args:
         model: the network.
@@ -35,12 +38,12 @@ def encode(model: Model, points: Float[Array, "points 3"], thinnings: int = THIN
         thinnings: how many are averaged, see `sampling.thinnings`; 0 uses all points as they are.
 
     Returns:
-        The field, in the world frame. It moves and turns with the points but for ties that rounding decides: in thinning, and, of a network with asymmetry, in which
-        point is the farthest from the mean.
+        The field, in the world frame. It moves and turns with the points but for ties that rounding decides: in
+        thinning, and, of a network with asymmetry, in which point is the farthest from the mean.
 
     Raises:
-        InputError: the points are fewer than 21 or than the network's neighbours, not (points, 3), not finite or all equal; thinnings is negative, or the points would
-            be thinned under `jax.jit`.
+        InputError: the points are fewer than 21 or than the network's neighbours, not (points, 3), not finite or all
+            equal; thinnings is negative, or the points would be thinned under `jax.jit`.
     """
     points, count = check_points(points), model.info.cloud_points
     if not isinstance(thinnings, int | np.integer) or thinnings < 0:
@@ -100,10 +103,12 @@ def _average(params, config, clouds, tip):
 def agreeing(latents: Float[Array, "thinnings latent 3"], used: Bool[Array, " thinnings"]) -> Bool[Array, " thinnings"]:
     """Which latents of one object show it in the same of several poses that it cannot be told apart in.
 
-    Thinned this way or that, a symmetric object looks a little more like one of the poses its symmetry makes equal or like another, and the network decides for one of them: a flat
-    bottle's two sides change places, a round one is turned about its axis. The mean of such latents is the latent of none of them: of round bottles it had an IoU of 0.87, each alone 0.93. Two latents agree
-    if a rotation would bring them no nearer than to half of their squared distance, or turns by less than `SAME_SIDE`; those that agree with the one that most others agree with are kept, of an object without
-    symmetry all.
+    Thinned this way or that, a symmetric object looks a little more like one of the poses its symmetry makes equal or
+    like another, and the network decides for one of them: a flat bottle's two sides change places, a round one is
+    turned about its axis. The mean of such latents is the latent of none of them: of round bottles it had an IoU of
+    0.87, each alone 0.93. Two latents agree if a rotation would bring them no nearer than to half of their squared
+    distance, or turns by less than `SAME_SIDE`; those that agree with the one that most others agree with are kept, of
+    an object without symmetry all.
 
     Args:
         latents: of thinnings of one cloud.
@@ -128,7 +133,8 @@ def agreeing(latents: Float[Array, "thinnings latent 3"], used: Bool[Array, " th
 def _latent(params, config, points, tip, used=None):
     """Latent and origin of a cloud with a farthest point `tip`, or of the part of it that is used."""
     origin = jnp.mean(points, axis=0, where=None if used is None else used[:, None])
-    # A cloud that was centred in float32 has a mean of about 1e-9 m left. Centring it again in float64 moves the latent by 1e-6
-    # of its length, so it counts as centred: parity with the original, which leaves centring to the caller, is then exact.
+    # A cloud that was centred in float32 has a mean of about 1e-9 m left. Centring it again in float64 moves the latent
+    # by 1e-6 of its length, so it counts as centred: parity with the original, which leaves centring to the caller, is
+    # then exact.
     origin = jnp.where(jnp.max(jnp.abs(origin)) <= CENTRED * jnp.max(jnp.ptp(points, axis=0)), 0.0, origin)
     return encode_latent(params, config, points - origin, used, tip - origin), origin

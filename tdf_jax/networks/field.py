@@ -18,7 +18,8 @@ class DescriptorField:
 
     Attributes:
         conditioned: the decoder folded onto the object's latent.
-        origin: mean of the points it was encoded from, (3,), metres, world frame; the object frame has the world's axes.
+        origin: mean of the points it was encoded from, (3,), metres, world frame; the object frame has the world's
+            axes.
     """
 
     conditioned: Conditioned
@@ -37,7 +38,8 @@ class DescriptorField:
         """
         activations, _ = self._decode("descriptors", x)
         descriptor = jnp.concatenate(activations, axis=-1)
-        # |p|^2 and fc_in are never all zero together in a trained network, so the square root is differentiable where it matters.
+        # |p|^2 and fc_in are never all zero together in a trained network, so the square root is differentiable where
+        # it matters.
         return descriptor / jnp.maximum(jnp.sqrt(jnp.sum(descriptor**2, axis=-1, keepdims=True)), NORM_FLOOR)
 
     def occupancy(self, x: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:

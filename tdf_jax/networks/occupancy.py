@@ -3,9 +3,9 @@
 A cloud of points becomes a latent of 3-vectors that turns with the cloud (`encode_latent`); the latent, folded into
 the decoder's first layer (`condition`), answers points of space with an occupancy and a descriptor (`decode`).
 
-Parameter names are those of the published PyTorch checkpoints, except that a `weight` (out, in) is a `kernel`
-(in, out) here. A vector feature is a tuple of its three planes, x, y and z, each (points, channels): on a CPU the scalar
-products of the vector ReLU then fuse with their neighbours, 10 times faster than a sum over an axis of one array.
+Parameter names are those of the published PyTorch checkpoints, except that a `weight` (out, in) is a `kernel` (in, out)
+here. A vector feature is a tuple of its three planes, x, y and z, each (points, channels): on a CPU the scalar products
+of the vector ReLU then fuse with their neighbours, 10 times faster than a sum over an axis of one array.
 
 References:
     Simeonov et al., Neural Descriptor Fields, 2021; Deng et al., Vector Neurons, 2021.
@@ -50,8 +50,9 @@ class NetworkConfig:
         neighbours: nearest neighbours of an edge feature, the point itself included.
         slope: negative slope of the encoder's vector leaky ReLUs and of the decoder's last activation.
         scaling: factor on all coordinates before the network; the network's unit is 0.1 m.
-        asymmetry: the encoder sees a cloud displaced by this share of the vector from its mean to its farthest point, away from that point; 0 as published. What a rotation leaves
-            as it is, an equivariant network shows as a figure of revolution; displaced, a square bowl has a side to begin at.
+        asymmetry: the encoder sees a cloud displaced by this share of the vector from its mean to its farthest point,
+            away from that point; 0 as published. What a rotation leaves as it is, an equivariant network shows as a
+            figure of revolution; displaced, a square bowl has a side to begin at.
     """
 
     latent: int = 256
@@ -90,7 +91,8 @@ class ResidualBlock(nn.Module):
 
     def setup(self):
         self.fc_0 = Affine(self.width, self.width, gain=2.0)
-        # A small second layer starts every block near the identity: five of them then keep the variance of fc_in's output.
+        # A small second layer starts every block near the identity: five of them then keep the variance of fc_in's
+        # output.
         self.fc_1 = Affine(self.width, self.width, gain=0.1)
 
 
@@ -184,7 +186,8 @@ def encode_latent(
         config: its sizes.
         points: centred on their mean, metres.
         used: which of them count; all by default.
-        tip: where `config.asymmetry` takes the farthest point to be, relative to the mean; by default the farthest of those that count.
+        tip: where `config.asymmetry` takes the farthest point to be, relative to the mean; by default the farthest of
+            those that count.
     """
     return OccupancyNetwork(config).apply({"params": params}, points, used, tip, method="encode_latent")
 
@@ -204,8 +207,8 @@ def decode(conditioned: Conditioned, x: Float[Array, "*batch 3"]) -> tuple[list,
         x: query points relative to the cloud's mean, metres.
 
     Returns:
-        The activations a descriptor is made of, in its order (|p|^2, z p, invariants, fc_in, blocks), each (*batch, width), and
-        the occupancy logits (*batch,).
+        The activations a descriptor is made of, in its order (|p|^2, z p, invariants, fc_in, blocks), each (*batch,
+        width), and the occupancy logits (*batch,).
     """
     p = x * conditioned.config.scaling
     square = jnp.sum(p * p, axis=-1, keepdims=True)

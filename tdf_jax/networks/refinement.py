@@ -14,32 +14,37 @@ from tdf_jax.networks.model import Model
 from tdf_jax.networks.occupancy import condition, decode
 
 POINTS = 1500  # of the cloud that are used: one size, so that clouds of all sizes run one program
-RATE = 0.003  # length of the first step, of the latent's root mean square vector; twice as much fits the noise of 2 mm, six times destroys the shape
+# length of the first step, of the latent's root mean square vector; twice as much fits the noise of 2 mm, six times
+# destroys the shape
+RATE = 0.003
 DECAYS = 0.9, 0.999  # of the moments, Adam's
 
 
 def refine(model: Model, field: DescriptorField, points: Float[Array, "points 3"], steps: int = 40) -> DescriptorField:
     """Move a field's latent so that the points of its object come to its surface.
 
-    The encoder sees a few hundred of an object's points at a time and knows its surface from them to a few millimetres. The mean of
-    (occupancy - 1/2)^2 over up to 1500 points, lowered by gradient steps on the latent with the network as it is, adds what the others say.
-    It is for shapes: reconstruction, clearance. Poses found with a refined field are hardly other ones (docs/evaluation.md). It has no reverse-mode derivative.
+    The encoder sees a few hundred of an object's points at a time and knows its surface from them to a few millimetres.
+    The mean of (occupancy - 1/2)^2 over up to 1500 points, lowered by gradient steps on the latent with the network as
+    it is, adds what the others say. It is for shapes: reconstruction, clearance. Poses found with a refined field are
+    hardly other ones (docs/evaluation.md). It has no reverse-mode derivative.
 
     Args:
         model: the network that encoded the field.
         field: the object's.
-        points: its cloud, the same or a denser one, metres, world frame; of more than 1500, as many drawn by a fixed seed are used.
+        points: its cloud, the same or a denser one, metres, world frame; of more than 1500, as many drawn by a fixed
+            seed are used.
         steps: gradient steps; 0 changes nothing.
 
     Returns:
         The field, its origin unchanged; it turns with the points as the field that came in does.
 
     Raises:
-        InputError: the points are not as for `encode`, or traced by `jax.jit`; steps is negative; the field is that of a network of other sizes.
+        InputError: the points are not as for `encode`, or traced by `jax.jit`; steps is negative; the field is that of
+            a network of other sizes.
 
     Source:
-        Steps are VectorAdam's, of one length for the three numbers of a vector, so that they turn with the cloud: Ling, Sharp and Jacobson,
-        NeurIPS 2022. Fitting a latent to observations is as in DeepSDF: Park et al., CVPR 2019.
+        Steps are VectorAdam's, of one length for the three numbers of a vector, so that they turn with the cloud: Ling,
+        Sharp and Jacobson, NeurIPS 2022. Fitting a latent to observations is as in DeepSDF: Park et al., CVPR 2019.
     """
     points = check_points(points)
     if isinstance(points, jax.core.Tracer):

@@ -7,7 +7,8 @@ from jaxtyping import Float
 from tdf_jax.geometry.winding import libigl
 from tdf_jax.networks.field import DescriptorField
 
-CELLS = 120  # along the diagonal of the box that is searched: 1.7 mm on a common mug; coarser ones tear its wall into stripes
+# along the diagonal of the box that is searched: 1.7 mm on a common mug; coarser ones tear its wall into stripes
+CELLS = 120
 CHUNK = 20_000  # points evaluated at a time
 
 
@@ -19,7 +20,8 @@ def reconstructed(
     Args:
         field: of an object in the world.
         T_world_object: how the object's frame lies there, 4x4.
-        bounds: lowest and highest corner of the object, in its frame, metres; 5 % of the diagonal beyond are searched too.
+        bounds: lowest and highest corner of the object, in its frame, metres; 5 % of the diagonal beyond are searched
+            too.
 
     Returns:
         Triangles in the object's frame, metres; none if the occupancy is nowhere above 0.5.

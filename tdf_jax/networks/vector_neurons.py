@@ -19,8 +19,9 @@ class VectorMap(nn.Module):
     outputs: int
 
     def setup(self):
-        # Standard deviation 1/sqrt(inputs) keeps the variance from layer to layer. PyTorch's default is smaller by sqrt(3);
-        # through the encoder's depth that starts the latent at rms 1e-4, and the decoder then sees nothing but |p|^2.
+        # Standard deviation 1/sqrt(inputs) keeps the variance from layer to layer. PyTorch's default is smaller by
+        # sqrt(3); through the encoder's depth that starts the latent at rms 1e-4, and the decoder then sees nothing but
+        # |p|^2.
         self.kernel = self.param("kernel", nn.initializers.lecun_normal(), (self.inputs, self.outputs))
 
     def __call__(self, x: Vectors) -> Vectors:
@@ -80,10 +81,10 @@ class EdgeConvolution(nn.Module):
     """Edge features of the nearest neighbours, a vector linear map, a vector leaky ReLU and the mean over neighbours.
 
     The edge features of a neighbour are e = neighbour - x, x, and c = neighbour x x = e x x. The (points, neighbours,
-    3, channels) activations are never formed: <feature,d> and |d|^2 are linear in the scalar products of (e, x, c),
-    of which only four differ from zero (c is normal to e and x), and the mean over neighbours needs only the mean of s and of
-    s e, s being the reflection's coefficient: the mean of s x is (mean s) x, that of s c is (mean s e) x x.
-    Equal to the plain form to rounding, and without its memory.
+    3, channels) activations are never formed: <feature,d> and |d|^2 are linear in the scalar products of (e, x, c), of
+    which only four differ from zero (c is normal to e and x), and the mean over neighbours needs only the mean of s and
+    of s e, s being the reflection's coefficient: the mean of s x is (mean s) x, that of s c is (mean s e) x x. Equal to
+    the plain form to rounding, and without its memory.
     """
 
     channels: int
@@ -101,10 +102,12 @@ class EdgeConvolution(nn.Module):
         own = tuple(points.T)  # planes (points,)
         spread = map_planes(lambda plane: plane[:, None], own)
         neighbours = points[nearest_neighbours(points, self.neighbours, used)]
-        edge = map_planes(lambda a, x: a - x, tuple(jnp.moveaxis(neighbours, -1, 0)), spread)  # planes (points, neighbours)
+        # planes (points, neighbours)
+        edge = map_planes(lambda a, x: a - x, tuple(jnp.moveaxis(neighbours, -1, 0)), spread)
         cross = _cross(edge, spread)
         products = vector_dot(edge, edge), vector_dot(edge, spread), vector_dot(spread, spread), vector_dot(cross, cross)
-        # Four terms written out, not a matrix product, which is not fused with what follows: 5 ms for 1500 points instead of 16.
+        # Four terms written out, not a matrix product, which is not fused with what follows: 5 ms for 1500 points
+        # instead of 16.
         inner, squared = (
             sum(product[:, :, None] * weight for product, weight in zip(products, _bilinear(kernel, direction)))
             for kernel in (feature, direction)
@@ -133,7 +136,8 @@ def nearest_neighbours(points: Float[Array, "points 3"], count: int, used: Bool[
     points = jax.lax.stop_gradient(points)
 
     def nearest(x):
-        # Differences, not |a|^2 + |b|^2 - 2ab: in float32 the latter misorders near neighbours of a cloud far from zero.
+        # Differences, not |a|^2 + |b|^2 - 2ab: in float32 the latter misorders near neighbours of a cloud far from
+        # zero.
         squared = sum((points[:, axis] - x[axis]) ** 2 for axis in range(3))
         squared = squared if used is None else jnp.where(used, squared, jnp.inf)
         return jax.lax.top_k(-squared, count)[1]

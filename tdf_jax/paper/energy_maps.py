@@ -17,7 +17,8 @@ from tdf_jax.paper import setting as settings
 from tdf_jax.paper.setting import SHAPES, Setting
 
 HALF = 1.2  # of the square's side, in the paper's unit
-UPRIGHT_TURN = 60.0  # degrees about z of the turned mugs, whose true paths so stay in the plane; `Setting.turn` if it is a number
+# degrees about z of the turned mugs, whose true paths so stay in the plane; `Setting.turn` if it is a number
+UPRIGHT_TURN = 60.0
 FIELDS = {  # what lies in the field, in words: which mug, and whether it is turned
     "reference mug": (0, False),
     "test mug": (1, False),
@@ -51,8 +52,9 @@ class Swept:
 def figure2(model: Model, base: Setting, field: str, count: int = 101) -> dict[str, Swept]:
     """Landscapes of one field, a panel a shape.
 
-    The query frame has the world's axes, as in the paper: the handle's frame is not tilted. A turned mug is turned about z, and the energy is
-    still that of the world's axes, so its minima lie where both the turned path and the axes are near.
+    The query frame has the world's axes, as in the paper: the handle's frame is not tilted. A turned mug is turned
+    about z, and the energy is still that of the world's axes, so its minima lie where both the turned path and the axes
+    are near.
 
     Args:
         model: the network.
@@ -69,7 +71,8 @@ def figure2(model: Model, base: Setting, field: str, count: int = 101) -> dict[s
     R = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
     points = ((scene.points if which else scene.demonstration.points) @ R.T).astype(np.float32)
     seen = encode(model, points)
-    # The paths are relative to the clouds' centres, as in the losses: on another mug they lie where its centre takes them.
+    # The paths are relative to the clouds' centres, as in the losses: on another mug they lie where its centre takes
+    # them.
     paths = {name: np.asarray(reference.trajectory.translations + seen.origin) for name, reference in references.items()}
     pick, orientation = paths["line"][0], references["line"].trajectory.rotations[0]
     swept = energy_landscape(seen, _joined(list(references.values())), plane_grid(HALF * base.unit, count, pick), orientation)

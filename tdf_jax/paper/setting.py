@@ -38,27 +38,30 @@ class Setting:
     docs/paper.md says why it is as it is.
 
     Attributes:
-        trajectory: the demonstration's shape, from the handle to a place 0.83 units along y; it bows to +x, the handle's side.
+        trajectory: the demonstration's shape, from the handle to a place 0.83 units along y; it bows to +x, the
+            handle's side.
         displacement: world vector, in the paper's unit.
-        displaced: what it moves: the endpoint ("goal", table 1), or the test mug and so the starting point ("start", section 3.1).
+        displaced: what it moves: the endpoint ("goal", table 1), or the test mug and so the starting point ("start",
+            section 3.1).
         k: weight of the correlation term, per unit.
         poses: of the trajectory, n.
         iterations: optimisation steps; the paper's epochs.
-        distance: of the first pose from the cloud's centre, on the handle's side, in the paper's unit (figure 3); by default it is at the
-            handle.
-        correlated: what the correlation term pulls towards: the demonstration, or the demonstration stretched to the displaced goal,
-            waypoint i of n moved by i / (n - 1) of the displacement.
+        distance: of the first pose from the cloud's centre, on the handle's side, in the paper's unit (figure 3); by
+            default it is at the handle.
+        correlated: what the correlation term pulls towards: the demonstration, or the demonstration stretched to the
+            displaced goal, waypoint i of n moved by i / (n - 1) of the displacement.
         pose_norm: norm of the correlation term, see docs/energy.md.
         lever: metres that a turn of one unit counts as in the correlation term.
         compensator: weight of eq. 6, steps in metres and turns as they are.
         compensator_order: eq. 6 summed over steps ("frobenius"), or its largest step ("infinity").
         fix_last: whether the last pose stays at the goal or only starts there.
-        query: query points uniform in a cube ("box"), or normal about its middle as in NDF's demonstrations ("gaussian").
+        query: query points uniform in a cube ("box"), or normal about its middle as in NDF's demonstrations
+            ("gaussian").
         query_size: edge of the cube, or standard deviation, metres; by default 0.1 and 0.025.
         queries: number of query points.
         start: poses random one by one ("scattered"), or the whole demonstration turned at random ("carried").
-        translation_rate: Adam's first step size for translations, metres; a pose travels at most half of `iterations` times as far. The
-            0.01 m of `tdf_jax.OptimizeConfig` are for a path of 0.3 m.
+        translation_rate: Adam's first step size for translations, metres; a pose travels at most half of `iterations`
+            times as far. The 0.01 m of `tdf_jax.OptimizeConfig` are for a path of 0.3 m.
         inits: random starts; the one with the least energy counts.
         diagonal: of both mugs, metres.
         unit: metres the paper's unit is.

@@ -1,7 +1,7 @@
 """Clearance of a motion from obstacles, measured on the way as well as at the poses, and trajectories pushed clear of what they would hit.
 
-A body is a set of points fixed in the query frame: the gripper's, those of the object it holds. Between two poses the query frame's origin goes
-straight and its rotation along the geodesic.
+A body is a set of points fixed in the query frame: the gripper's, those of the object it holds. Between two poses the
+query frame's origin goes straight and its rotation along the geodesic.
 """
 
 import functools
@@ -31,8 +31,8 @@ from tdf_jax.planning.distances import (
 
 POINTS = 64  # of the body that a descent looks at: spread evenly, then some of those that were missed
 LOOK = 0.01  # metres that a point of the body moves at most between the looks of a descent, along the given path
-# Metres aimed at beyond what is required, in the descents one after the other: a detour is longer than the given path, and what it keeps at the
-# looks it does not quite keep between them.
+# Metres aimed at beyond what is required, in the descents one after the other: a detour is longer than the given path,
+# and what it keeps at the looks it does not quite keep between them.
 SLACK = 0.0015, 0.003, 0.006
 BEST = 4  # detours that are measured with the whole body
 # Heights of the detours over the chord's length and twice the body's radius, each in all directions around the chord.
@@ -47,9 +47,11 @@ class ClearanceConfig:
 
     Attributes:
         lever: metres; a turn of one radian counts as a shift by as much.
-        deviation: weight of the deviation itself, over that of its bending (second derivative along the trajectory, whose length counts as 1).
+        deviation: weight of the deviation itself, over that of its bending (second derivative along the trajectory,
+            whose length counts as 1).
         ramp: metres of clearance gained per metre of way from an end that is closer than the margin.
-        contact: how deep an end may be inside of an obstacle, metres: what the pick's own contact and the errors of its surface come to.
+        contact: how deep an end may be inside of an obstacle, metres: what the pick's own contact and the errors of its
+            surface come to.
         directions: of the detours that are tried, around the chord.
         iterations: steps of a descent.
     """
@@ -104,11 +106,12 @@ def push_clear(
 ) -> Cleared:
     """Push a trajectory clear of obstacles, at its poses and between them; both end poses stay as they are.
 
-    What is required is the margin, from each obstacle; near an end that is closer to it than that, what the end keeps plus the way from there
-    (`ramp`). A trajectory that keeps it already comes back as it is. Otherwise the smoothest small deviation (shifts, and turns about the
-    middle of the body) that keeps it is sought from the given path and from detours to all sides of it: the other side of a wall is
-    another minimum. The four of least cost are measured with the whole body, and the first of them that is clear is taken. No draw is made: the result is
-    a function of the input, and moves with the scene.
+    What is required is the margin, from each obstacle; near an end that is closer to it than that, what the end keeps
+    plus the way from there (`ramp`). A trajectory that keeps it already comes back as it is. Otherwise the smoothest
+    small deviation (shifts, and turns about the middle of the body) that keeps it is sought from the given path and
+    from detours to all sides of it: the other side of a wall is another minimum. The four of least cost are measured
+    with the whole body, and the first of them that is clear is taken. No draw is made: the result is a function of the
+    input, and moves with the scene.
 
     One program is compiled for each number of poses, body points and obstacles of a kind, and coarseness of the looks.
 
@@ -126,8 +129,8 @@ def push_clear(
         InputError: as for `clearance`, or the margin is negative, or config is of another kind.
 
     Source:
-        Trajectory optimisation on signed distances with smoothness as the metric is that of CHOMP: Zucker et al., IJRR 2013. Steps here are
-        Levenberg and Marquardt's.
+        Trajectory optimisation on signed distances with smoothness as the metric is that of CHOMP: Zucker et al., IJRR
+        2013. Steps here are Levenberg and Marquardt's.
     """
     if not isinstance(config, ClearanceConfig):
         raise InputError(f"push_clear(): config is {config!r}; expected a ClearanceConfig")
@@ -237,7 +240,8 @@ def _push(groups, wxyz_xyz, body, wanted, starts, numbers, iterations):
     required = jnp.moveaxis(wanted, -1, 0)[..., None]
     f = jnp.arange(checks, dtype=dtype) / checks
     exact = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
-    # Second derivative and size of a deviation that is zero at both ends, as integrals over the trajectory, of length 1.
+    # Second derivative and size of a deviation that is zero at both ends, as integrals over the trajectory, of length
+    # 1.
     second = np.diff(np.eye(n), n=2, axis=0)[:, 1:-1]
     metric = jnp.asarray(second.T @ second * segments**3, dtype) + weight * jnp.eye(n - 2, dtype=dtype) / segments
     stiffness = jnp.kron(metric, jnp.eye(6, dtype=dtype))
@@ -261,8 +265,8 @@ def _push(groups, wxyz_xyz, body, wanted, starts, numbers, iterations):
         rows = jnp.concatenate([normals, jnp.cross(jnp.broadcast_to(arms, normals.shape), normals)], axis=-1)
         rows = jnp.where((short > 0)[..., None], rows, 0)
         squares, pulls = exact("oscpi,oscpj->scij", rows, rows), -exact("oscpi,oscp->sci", rows, short)
-        # The frame at the look shifts and turns by the parts of the two poses'; for turns that is so where the two differ by a small angle, which
-        # slows the descent where they do not, and changes nothing else.
+        # The frame at the look shifts and turns by the parts of the two poses'; for turns that is so where the two
+        # differ by a small angle, which slows the descent where they do not, and changes nothing else.
         turns = jax.vmap(jax.jacfwd(se3.exp))(u[:, 3:] / lever)
         turns = exact("nijk,nlj->nilk", turns, se3.exp(u[:, 3:] / lever))
         twist = jnp.stack([turns[:, 2, 1], turns[:, 0, 2], turns[:, 1, 0]], axis=1) / lever

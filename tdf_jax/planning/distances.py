@@ -14,7 +14,9 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.trajectory import Trajectory, check_trajectory
 
-STEP = 0.005  # metres: no point of the body moves farther between two looks, so that a wall seen by none of them is thinner than what it sees in 5 mm
+# metres: no point of the body moves farther between two looks, so that a wall seen by none of them is thinner than what
+# it sees in 5 mm
+STEP = 0.005
 MOST_BETWEEN = 255  # looks between two poses
 ROUNDING = 1e-5  # metres
 
@@ -53,7 +55,8 @@ def clearance(
 
     Args:
         trajectory: T_world_query, at least one pose.
-        body: points of what moves, metres, query frame. What is between them is not seen: an obstacle thinner than their distance can pass.
+        body: points of what moves, metres, query frame. What is between them is not seen: an obstacle thinner than
+            their distance can pass.
         obstacles: at least one.
         between: poses to look at between two; by default so many that no point moves more than 5 mm (up to 255).
 
@@ -61,8 +64,8 @@ def clearance(
         The distances.
 
     Raises:
-        InputError: the trajectory fails `check_trajectory`, the body is not finite points, there is no obstacle or one of another kind, or between is
-            not a whole number of 0 to 255.
+        InputError: the trajectory fails `check_trajectory`, the body is not finite points, there is no obstacle or one
+            of another kind, or between is not a whole number of 0 to 255.
     """
     wxyz_xyz, body, groups, order = prepare("clearance", trajectory, body, obstacles)
     if between is None:

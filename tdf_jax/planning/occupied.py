@@ -19,20 +19,22 @@ if TYPE_CHECKING:
 FIELD_BLOCK = 8192  # points of a field evaluated in one call: one size, so that objects of all sizes run one program
 
 
-# Occupancies are asked within this of the cloud's bounding box, metres: farther away the network knows no shapes, and of four mugs
-# sampled to 0.2 m about them all had solid blobs in the air. Pieces of surface farther than this from all points are left out as well.
+# Occupancies are asked within this of the cloud's bounding box, metres: farther away the network knows no shapes, and
+# of four mugs sampled to 0.2 m about them all had solid blobs in the air. Pieces of surface farther than this from all
+# points are left out as well.
 FIELD_REACH = 0.015
 
 
 def field_obstacle(field: DescriptorField, points: Float[Array, "points 3"], pitch: float = 0.003, pad: float = 0.03) -> DistanceGrid:
     """The object itself to keep clear of, as its field knows it: the surface is where the occupancy is a half.
 
-    The field tells hidden sides too, which the cloud does not. Refine it first (`refine`): this is what that is for. How far from true the distances
-    are, docs/clearance.md tells.
+    The field tells hidden sides too, which the cloud does not. Refine it first (`refine`): this is what that is for.
+    How far from true the distances are, docs/clearance.md tells.
 
     Args:
         field: The object's.
-        points: Its cloud, metres, world frame; it tells where to look for surface: up to 15 mm away from its bounding box.
+        points: Its cloud, metres, world frame; it tells where to look for surface: up to 15 mm away from its bounding
+            box.
         pitch: Of the grid, metres; half of a wall's thickness or less, or the wall is lost in places.
         pad: How far the grid reaches beyond the points, metres; more than the margin that is kept.
 
@@ -40,8 +42,8 @@ def field_obstacle(field: DescriptorField, points: Float[Array, "points 3"], pit
         The obstacle.
 
     Raises:
-        InputError: The points are not a cloud, pitch or pad is not above 0, the grid has more than 4 million nodes, or the field has no surface within
-            15 mm of the points.
+        InputError: The points are not a cloud, pitch or pad is not above 0, the grid has more than 4 million nodes, or
+            the field has no surface within 15 mm of the points.
     """
     from scipy.ndimage import label
     from scipy.spatial import cKDTree

@@ -1,7 +1,7 @@
 """Parametric bottles: watertight meshes with ground truth frames and an exact inside test.
 
-Canonical frame: z up along the bottle's axis, a flat bottle's wide side and a handle along x, the origin on the axis at half the height.
-Bottles are solid but for the mouth of an open neck: what sensors see of them is their outside.
+Canonical frame: z up along the bottle's axis, a flat bottle's wide side and a handle along x, the origin on the axis at
+half the height. Bottles are solid but for the mouth of an open neck: what sensors see of them is their outside.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,8 @@ class BottleParameters:
         radius: of the body, along x.
         aspect: the body's extent along y over that along x, 0.35 (flat) to 1; no unit.
         squareness: superellipse exponent of the body's cross-section, 2 (round, oval) to 20 (square); no unit.
-        bulge: added to the body's radius at half its height, fading as a parabola; positive is a barrel, negative a waist.
+        bulge: added to the body's radius at half its height, fading as a parabola; positive is a barrel, negative a
+            waist.
         edge_radius: rounding of the bottom edge.
         shoulder_bottom: height where the body ends and narrows to the neck.
         shoulder_top: height where the neck begins.
@@ -86,8 +87,8 @@ class BottleParameters:
 class Bottle(Shape):
     """One bottle with its ground truth; see `Shape`.
 
-    Its places lie on the axis: the neck (half way from where the shoulder is as wide as half of body and neck together to the top), the base (at the
-    plane it stands on) and the body (half way up to the shoulder).
+    Its places lie on the axis: the neck (half way from where the shoulder is as wide as half of body and neck together
+    to the top), the base (at the plane it stands on) and the body (half way up to the shoulder).
     """
 
     category = "bottle"

@@ -26,7 +26,8 @@ class BowlParameters:
         aspect: extent along y over that along x, 0.4 (oval) to 1; no unit.
         squareness: superellipse exponent of the cross-section, 2 (round, oval) to 20 (square); no unit.
         base_radius: of the base, or of the foot, along x.
-        curve: superellipse exponent of the side's profile, 1 (straight cone), 2 (quarter of an ellipse) to 6 (flat floor, upright wall); no unit.
+        curve: superellipse exponent of the side's profile, 1 (straight cone), 2 (quarter of an ellipse) to 6 (flat
+            floor, upright wall); no unit.
         rim_flare: how far the uppermost fifth of the side is turned out (positive) or drawn in (negative).
         wall_thickness: of the wall, across it, along x; an oval's is thinner along y, as its aspect.
         bottom_thickness: of the floor, above the foot.
@@ -60,8 +61,8 @@ class BowlParameters:
 class Bowl(Shape):
     """One bowl with its ground truth; see `Shape`.
 
-    Its places are the rim (origin on top of the wall on the +x side, x outward, z up), the base (on the axis, at the plane it stands on) and the body (on
-    the axis, at half the height).
+    Its places are the rim (origin on top of the wall on the +x side, x outward, z up), the base (on the axis, at the
+    plane it stands on) and the body (on the axis, at half the height).
     """
 
     category = "bowl"

@@ -104,7 +104,8 @@ class Mug(Shape):
     def landmarks(self) -> Float[np.ndarray, "landmarks 3"]:
         """Points that correspond from mug to mug, metres, object frame: as many on every mug, in the same order.
 
-        Along the handle at even shares of its centre line's length, on its four sides (inner, outer, left, right); on the outer wall at even shares of the height, at even angles.
+        Along the handle at even shares of its centre line's length, on its four sides (inner, outer, left, right); on
+        the outer wall at even shares of the height, at even angles.
         """
         p = self.parameters
         line = _even(_centre_line(p), _LANDMARKS_ALONG)

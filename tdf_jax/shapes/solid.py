@@ -89,8 +89,8 @@ def solid_rings(solid: Solid) -> np.ndarray:
 def in_loft(loft: Loft, points: np.ndarray) -> np.ndarray:
     """Which points (points, 3) lie in a loft: within the polygon it has at their height.
 
-    A mesh splits what lies between two rings into triangles; where the rings have different shapes these differ from the straight surface by
-    less than 1e-4 m on the rings of a bottle's shoulder.
+    A mesh splits what lies between two rings into triangles; where the rings have different shapes these differ from
+    the straight surface by less than 1e-4 m on the rings of a bottle's shoulder.
     """
     heights, radii = loft
     height = points[:, 2]

@@ -1,8 +1,8 @@
 """Trajectory optimisation: Adam on SO(3) x R^3, many random starts in one compiled program.
 
-The energy is a mean over poses, so (starts x poses) are one list of independent poses. It is walked in chunks, each giving its
-losses and six-number gradients before the next begins: memory does not grow with the number of starts, and no more than
-`chunk` x queries descriptors exist at a time.
+The energy is a mean over poses, so (starts x poses) are one list of independent poses. It is walked in chunks, each
+giving its losses and six-number gradients before the next begins: memory does not grow with the number of starts, and
+no more than `chunk` x queries descriptors exist at a time.
 """
 
 import dataclasses
@@ -36,13 +36,13 @@ class OptimizeConfig:
     Attributes:
         inits: random starts, M.
         iterations: Adam steps; the paper uses 100.
-        rotation_rate: Adam's first step size for rotations, radians. The nearest of 10 uniform rotations is 62 degrees from
-            a target on average: 100 steps of NDF's 0.01 would not take it there.
+        rotation_rate: Adam's first step size for rotations, radians. The nearest of 10 uniform rotations is 62 degrees
+            from a target on average: 100 steps of NDF's 0.01 would not take it there.
         translation_rate: the same for translations, metres.
         final_rate: last step size over the first; the rates fall as a cosine.
-        start: "carried" turns the whole demonstrated trajectory about the object's centroid, by one uniform rotation a start;
-            "scattered" draws each pose on its own, as the paper does: a uniform rotation, and a place uniform in a ball
-            of `start_radius` about the centroid.
+        start: "carried" turns the whole demonstrated trajectory about the object's centroid, by one uniform rotation a
+            start; "scattered" draws each pose on its own, as the paper does: a uniform rotation, and a place uniform in
+            a ball of `start_radius` about the centroid.
         start_radius: metres, for "scattered".
         chunk: poses evaluated at a time; None chooses. Changes speed and memory, not the result.
     """
@@ -85,15 +85,17 @@ def optimize(
 ) -> Result:
     """Minimise `trajectory_energy` from many starts.
 
-    Each pose turns about the mean of the query points, so that turning does not move them away; results are about the query
-    frame's origin all the same. Start m is a function of the key and m.
+    Each pose turns about the mean of the query points, so that turning does not move them away; results are about the
+    query frame's origin all the same. Start m is a function of the key and m.
 
     Args:
         field: the new object's.
         reference: the demonstration's.
         key: random key of the starts.
-        goal: last pose of every start, T_world_query; by default, if it is kept, the demonstration's, carried by the centroids.
-        fix_last: keep the last pose at the goal; otherwise it is free, and starts at the goal or, without one, at random as the others.
+        goal: last pose of every start, T_world_query; by default, if it is kept, the demonstration's, carried by the
+            centroids.
+        fix_last: keep the last pose at the goal; otherwise it is free, and starts at the goal or, without one, at
+            random as the others.
         energy: weights of the terms.
         config: settings.
         starts: use these instead of random ones; their last poses are replaced by the goal only where one is given.
@@ -104,8 +106,8 @@ def optimize(
         All starts' results.
 
     Raises:
-        InputError: starts, goal, weights or mesh of a wrong shape, type or value, a reference from another network than the field, or nothing to
-            move: one pose, and that kept.
+        InputError: starts, goal, weights or mesh of a wrong shape, type or value, a reference from another network than
+            the field, or nothing to move: one pose, and that kept.
     """
     starts, energy = prepare("optimize()", field, reference, key, goal, fix_last, energy, config, starts, mesh)
     inits, dtype = len(starts), starts.dtype

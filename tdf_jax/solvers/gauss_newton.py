@@ -1,7 +1,8 @@
 """Damped Gauss-Newton steps on single poses, each with the waypoint that it is to match.
 
-A step solves (H + damping diag(H)) delta = -gradient for each pose. The gradient is the energy's own; H is that of the absolute values
-replaced by r^2 / (2 max(|r|, s)), with s the mean |r| of the query point: iteratively reweighted least squares, made less steep near zero.
+A step solves (H + damping diag(H)) delta = -gradient for each pose. The gradient is the energy's own; H is that of the
+absolute values replaced by r^2 / (2 max(|r|, s)), with s the mean |r| of the query point: iteratively reweighted least
+squares, made less steep near zero.
 """
 
 import functools
@@ -20,7 +21,8 @@ from tdf_jax.geometry import se3 as poses
 LARGEST_TURN, LARGEST_MOVE = 0.7, 0.05  # radians and metres of one step
 DAMPINGS = 1e-3, 1e3  # least and greatest
 ACCEPTED, REJECTED = 0.3, 4.0  # factors on the damping
-LEAST_DIFFERENCE = 1e-4  # metres; the curvature of eq. 3's norm grows without bound towards zero: that of no smaller difference is taken
+# metres; the curvature of eq. 3's norm grows without bound towards zero: that of no smaller difference is taken
+LEAST_DIFFERENCE = 1e-4
 
 
 class Problem(NamedTuple):
@@ -79,7 +81,8 @@ def descend(R, place, waypoint, bounds, damping, tolerance, field, problem, ener
     """Damped Gauss-Newton steps, until none promises to gain by the tolerance.
 
     Args:
-        R, place: rotations of the query frame in the world, (poses, 3, 3), and places of the query points' mean, (poses, 3), metres.
+        R, place: rotations of the query frame in the world, (poses, 3, 3), and places of the query points' mean,
+            (poses, 3), metres.
         waypoint: of each pose, what it is to match.
         bounds: how many of the poses move, how many are evaluated, blocks of query points, most steps.
         damping: of the first step.
@@ -90,7 +93,8 @@ def descend(R, place, waypoint, bounds, damping, tolerance, field, problem, ener
         mesh: devices that the poses are dealt out to in turns.
 
     Returns:
-        R, place, and energies at the start and after each step, (poses, length); those of steps that were not taken are the latest.
+        R, place, and energies at the start and after each step, (poses, length); those of steps that were not taken are
+        the latest.
     """
     work = functools.partial(_steps, length=length, chunk=chunk, axes=mesh.axis_names if mesh is not None else ())
     if mesh is not None:
@@ -104,7 +108,8 @@ def _steps(R, place, waypoint, bounds, damping, tolerance, field, problem, energ
     """`descend` on one device; `axes` are the mesh's."""
     if axes:
         parts, part = jax.lax.axis_size(axes), jax.lax.axis_index(axes)
-        bounds = bounds.at[:2].set((bounds[:2] - part + parts - 1) // parts)  # of the poses dealt out, those of this device
+        # of the poses dealt out, those of this device
+        bounds = bounds.at[:2].set((bounds[:2] - part + parts - 1) // parts)
     moving, _, _, steps = bounds
     moves = jnp.arange(len(R)) < moving
 
@@ -186,7 +191,8 @@ def _match(R, place, field, query, weights, shown):
     def along(axis):
         return jax.jvp(field.descriptors, (x,), (jnp.broadcast_to(axis, x.shape),))
 
-    found, tangents = jax.vmap(along, out_axes=(None, 1))(jnp.eye(3, dtype=x.dtype))  # (points, channels), (points, 3, channels)
+    # (points, channels), (points, 3, channels)
+    found, tangents = jax.vmap(along, out_axes=(None, 1))(jnp.eye(3, dtype=x.dtype))
     residual = found - shown.reshape(found.shape)
     size = jnp.abs(residual)
     mean = jnp.mean(size, axis=-1)

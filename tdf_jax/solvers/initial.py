@@ -80,7 +80,8 @@ def default_goal(field: DescriptorField, reference: Reference) -> Float[Array, "
 
 
 def _check_weights(function, energy):
-    # Here, not where they are made: a gradient with respect to the weights is an EnergyWeights too, and may be negative.
+    # Here, not where they are made: a gradient with respect to the weights is an EnergyWeights too, and may be
+    # negative.
     for name in ("correlation", "compensator", "lever"):
         value = getattr(energy, name)
         if not isinstance(value, jax.core.Tracer) and not (np.ndim(value) == 0 and 0 <= float(value) < np.inf):

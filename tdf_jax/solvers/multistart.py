@@ -1,14 +1,16 @@
 """Trajectory optimisation by damped Gauss-Newton steps: the energy that `optimize` minimises, for a small part of its work.
 
-Without eq. 6 the energy is a sum over waypoints of terms of one pose each, six unknowns apart from all others. So a waypoint may take the best
-of all candidates, whichever start it came from, and a good pose of one waypoint, carried rigidly, is a candidate for every other. The waypoint nearest the object,
-the keyframe, has the steepest field and the most false minima: a random start came down to the right one in 6 to 19 % of cases. It gets more starts than the others. The search
-runs on a few of the query points; only the last stage sees all of them:
+Without eq. 6 the energy is a sum over waypoints of terms of one pose each, six unknowns apart from all others. So a
+waypoint may take the best of all candidates, whichever start it came from, and a good pose of one waypoint, carried
+rigidly, is a candidate for every other. The waypoint nearest the object, the keyframe, has the steepest field and the
+most false minima: a random start came down to the right one in 6 to 19 % of cases. It gets more starts than the others.
+The search runs on a few of the query points; only the last stage sees all of them:
 
 1. scout: the keyframe from many random starts, few points;
 2. halve: the best quarter of those, few points;
 3. search: every waypoint of some random starts, few points;
-4. carry: the demonstration as the keyframe's finalists, the best pose of each waypoint, or the centroids alone carry it, few points;
+4. carry: the demonstration as the keyframe's finalists, the best pose of each waypoint, or the centroids alone carry
+it, few points;
 5. refine: the best distinct candidates of each waypoint, few points;
 6. polish: the same, all query points.
 """
@@ -34,7 +36,8 @@ from tdf_jax.solvers import gauss_newton as descent
 from tdf_jax.solvers.initial import STARTS, prepare
 from tdf_jax.solvers.result import Result
 
-# Points whose descriptors and 3 tangents exist at a time: 4 MB. With 500 query points a chunk of 512 took twice as long a point on a CPU with 2 MB of second-level cache a core.
+# Points whose descriptors and 3 tangents exist at a time: 4 MB. With 500 query points a chunk of 512 took twice as long
+# a point on a CPU with 2 MB of second-level cache a core.
 CHUNK_POINTS = 128
 FIRST_DAMPINGS = 1.0, 0.3, 1.0, 0.3, 0.1, 0.03  # of the six stages
 SAME_ANGLE, SAME_DISTANCE = np.radians(10), 0.01  # radians and metres within which two candidates count as one
@@ -118,13 +121,16 @@ def solve(
         field, reference, key, goal, fix_last, energy: as for `optimize`.
         config: settings.
         starts: use these instead of random ones, all of them as scouts and in the search.
-        progress: called after each stage with the steps done and the energies of the best trajectories so far, on the query points of
-            the stage and without a fixed last pose (of the first two, those of the keyframe); may raise to cancel.
-        mesh: devices to share the candidates, of this process or of several that make the same call; see docs/scaling.md.
+        progress: called after each stage with the steps done and the energies of the best trajectories so far, on the
+            query points of the stage and without a fixed last pose (of the first two, those of the keyframe); may raise
+            to cancel.
+        mesh: devices to share the candidates, of this process or of several that make the same call; see
+            docs/scaling.md.
 
     Returns:
-        A result whose rows are trajectories of the best, second best, ... candidates of each waypoint. Its `losses` are theirs from the search on,
-        before the last stage on the few query points; its `starts` are where the last stage began, `steps[-1]` steps before the end.
+        A result whose rows are trajectories of the best, second best, ... candidates of each waypoint. Its `losses` are
+        theirs from the search on, before the last stage on the few query points; its `starts` are where the last stage
+        began, `steps[-1]` steps before the end.
 
     Raises:
         InputError: as for `optimize`, or a weight on eq. 6, which couples the waypoints.

@@ -1,8 +1,9 @@
 """The demonstration carried to a new object: its pick found by descriptors, the way to the goal turned evenly.
 
-Eq. 3 of the paper holds every waypoint near the demonstration's pose in the world, and its descriptors pull every waypoint along with
-the object: where object and goal moved differently the two disagree, waypoint by waypoint. Here descriptors find one motion, that of the pick, and the goal
-gives the other; each waypoint is carried by what lies between them (docs/benchmark.md compares).
+Eq. 3 of the paper holds every waypoint near the demonstration's pose in the world, and its descriptors pull every
+waypoint along with the object: where object and goal moved differently the two disagree, waypoint by waypoint. Here
+descriptors find one motion, that of the pick, and the goal gives the other; each waypoint is carried by what lies
+between them (docs/benchmark.md compares).
 """
 
 import dataclasses
@@ -32,10 +33,12 @@ class CarryConfig:
 
     Attributes:
         scouts: random starts.
-        finalists: candidates that are kept to the end, the rows of the result; several may come to one pose, see `cluster_poses`.
+        finalists: candidates that are kept to the end, the rows of the result; several may come to one pose, see
+            `cluster_poses`.
         points: query points that all stages but the last see, drawn at random from all.
-        steps: most steps of the four stages: from all scouts, from the best quarter of them, of the finalists, and of these with all query points. The last are many, so
-            that the finalists tell how many distinct solutions there are: after four some are 5 to 90 degrees from their minima.
+        steps: most steps of the four stages: from all scouts, from the best quarter of them, of the finalists, and of
+            these with all query points. The last are many, so that the finalists tell how many distinct solutions there
+            are: after four some are 5 to 90 degrees from their minima.
         tolerance, start, start_radius, chunk: see `SolveConfig`.
     """
 
@@ -87,7 +90,8 @@ def carry(
         progress, mesh: see `solve`.
 
     Returns:
-        A result whose rows are the picks that the solver's finalists came to, each with its trajectory; losses and energies are those of the picks' descriptors.
+        A result whose rows are the picks that the solver's finalists came to, each with its trajectory; losses and
+        energies are those of the picks' descriptors.
 
     Raises:
         InputError: as for `solve`, or a goal that fix_last=False would not keep.

@@ -23,9 +23,12 @@ class Result:
         losses: (inits, iterations), the energy before each step; the first column is the start's.
         energies: (inits,), the energy of `trajectories`, after the last step.
         starts: (inits, poses, 7), where they began.
-        residual: of `carry`: what the best pick leaves of the demonstration's descriptors, see `tdf_jax.confidence`; None of others.
-        confidence: of `imitate` with `CarryConfig`: how likely the pick is right, in [0, 1], see `tdf_jax.confidence`; None of others, and with weights that it is not calibrated for.
-        recognised: of `imitate` with shipped weights: how likely the object is of the demonstration's category, in [0, 1], see `tdf_jax.recognition`; None of others.
+        residual: of `carry`: what the best pick leaves of the demonstration's descriptors, see `tdf_jax.confidence`;
+            None of others.
+        confidence: of `imitate` with `CarryConfig`: how likely the pick is right, in [0, 1], see `tdf_jax.confidence`;
+            None of others, and with weights that it is not calibrated for.
+        recognised: of `imitate` with shipped weights: how likely the object is of the demonstration's category, in [0,
+            1], see `tdf_jax.recognition`; None of others.
     """
 
     trajectories: Float[Array, "inits poses 7"]

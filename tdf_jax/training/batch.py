@@ -23,12 +23,14 @@ DENSE = 2000  # points a complete cloud is thinned from
 PARTIAL_SHARE = 0.6  # of the clouds: seen by one, two or four cameras
 SPARSE_SHARE = 0.3  # of the clouds: of `SPARSE_CLOUDS` points before thinning, log-uniform
 SPARSE_CLOUDS = (300, DENSE)
-NOISY_SHARE = 0.3  # of the clouds: normal noise with a standard deviation of up to `NOISE` of the diagonal, 2.5 mm on a real mug
+# of the clouds: normal noise with a standard deviation of up to `NOISE` of the diagonal, 2.5 mm on a real mug
+NOISY_SHARE = 0.3
 NOISE = 0.015
 OUTLIER_SHARE = 0.2  # of the clouds: some points anywhere in the padded box
 OUTLIERS = 0.005  # of the points, at most; thinning by farthest points keeps nearly all: up to 4 % of a thinned cloud
 
-# Boxes of query points, shown at a place of one object of a pair and offered to the other at the same place and at wrong poses.
+# Boxes of query points, shown at a place of one object of a pair and offered to the other at the same place and at
+# wrong poses.
 FIRST_SHARE = 0.6  # of the boxes at the first place of an object, a mug's handle; the others share the rest
 BOX_SIDES = (0.25, 0.55)  # of the pair's diagonal
 REMOTE_SHARE = 0.35  # of the boxes: not at the place itself but carried along with it
@@ -37,8 +39,12 @@ GLOBAL_SHARE = 0.4  # of the wrong poses: any rotation, any position about the o
 GLOBAL_SPREAD = 0.35  # standard deviation of the position, of the diagonal
 NEAR_ANGLES = (3.0, 90.0)  # degrees, log-uniform
 NEAR_DISTANCES = (0.01, 0.3)  # of the pair's diagonal, log-uniform
-QUARTERS = 4  # turns about the axis that are tried for a symmetric object's equal poses: all there are, but for round ones, which have any
-LEAST_WRONG = 0.01  # of the pair's diagonal: root mean square distance of query points from where a symmetric object's right poses have them
+# turns about the axis that are tried for a symmetric object's equal poses: all there are, but for round ones, which
+# have any
+QUARTERS = 4
+# of the pair's diagonal: root mean square distance of query points from where a symmetric object's right poses have
+# them
+LEAST_WRONG = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,8 +57,9 @@ class Batch:
         centres: origins of the objects' frames, relative to the cloud's mean.
         fold: symmetry of the objects, see `tdf_jax.symmetry`: it tells which of the frame's axes there are.
         shown: query points at a place of each object, relative to its mean.
-        offered: the same query points on the pair's other object, relative to that one's mean: first where the place has
-            them there, at `QUARTERS` poses that the object's symmetry makes equal, some of them the same, then at wrong poses.
+        offered: the same query points on the pair's other object, relative to that one's mean: first where the place
+            has them there, at `QUARTERS` poses that the object's symmetry makes equal, some of them the same, then at
+            wrong poses.
     """
 
     clouds: Float[np.ndarray, "pairs 2 points 3"]
@@ -73,8 +80,8 @@ def draw(
         data: the objects.
         rng: source of chance; a function of the seed and the step, so that a resumed run draws the same.
         pairs: pairs of objects in it.
-        points: points of every cloud, thinned by farthest points: 256 random ones drown the small asymmetries by which a
-            network finds the object's frame.
+        points: points of every cloud, thinned by farthest points: 256 random ones drown the small asymmetries by which
+            a network finds the object's frame.
         queries: labelled points of every object.
         corruption: how far clouds have come from complete ones (0) to what sensors give (1).
         box: query points of a place.
@@ -87,7 +94,8 @@ def draw(
         for which in range(2):
             if which == 0:  # all sources alike, and all kinds of one, however many objects they have
                 kind = _one_of(rng, _one_of(rng, data.sources))
-            # A partner is of the same kind: places mean the same on both, and what leaves one as it is leaves the other.
+            # A partner is of the same kind: places mean the same on both, and what leaves one as it is leaves the
+            # other.
             index = data.kinds[kind][rng.integers(len(data.kinds[kind]))]
             cloud = thin(_sensed(data, rng, index, corruption, points), points)
             chosen = rng.integers(data.queries.shape[1], size=queries)

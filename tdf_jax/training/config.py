@@ -22,8 +22,8 @@ class TrainConfig:
         poses: poses they are offered at, the right one, with its equals of a symmetric object, counted once.
         learning_rate: Muon's, on matrices; vectors, biases and the first layer use Adam at a sixth of it.
         warmup: steps of linear rise.
-        corruption: how far clouds come from complete ones (0) to what sensors give (1). From random weights it grows from the tenth
-            of the run on, and is all there at six tenths.
+        corruption: how far clouds come from complete ones (0) to what sensors give (1). From random weights it grows
+            from the tenth of the run on, and is all there at six tenths.
         validate_every: steps between validations.
         save_seconds: seconds between checkpoints.
     """

@@ -48,7 +48,8 @@ class Recipe:
         unit: metres per unit of the mesh files.
         up: their axis that points up.
         front: their axis towards what tells the object's side, such as a mug's handle, or along their longer side.
-        fold: their symmetry about the axis that points up: 1 none, 2 half turns, 4 quarters, 0 any turn leaves them as they are.
+        fold: their symmetry about the axis that points up: 1 none, 2 half turns, 4 quarters, 0 any turn leaves them as
+            they are.
         stretch: repeated meshes are scaled along every axis by up to e to this, at random.
     """
 
@@ -133,7 +134,8 @@ class DataSet:
 
     def digest(self) -> str:
         """A name for the contents, by which a resumed run knows its data again."""
-        symmetry = b"" if (self.fold == 1).all() else self.fold.astype(np.int8).tobytes()  # runs on mugs keep the names they had
+        # runs on mugs keep the names they had
+        symmetry = b"" if (self.fold == 1).all() else self.fold.astype(np.int8).tobytes()
         return hashlib.sha256(self.surface.tobytes() + self.inside.tobytes() + symmetry).hexdigest()[:16]
 
 

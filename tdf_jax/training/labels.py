@@ -64,7 +64,8 @@ def scanned_object(
         rng: source of chance.
         points, queries, cameras: how many.
         stretch: every axis is scaled by up to e to this, at random; 0 leaves the mesh as it is.
-        fold: symmetry of the mesh; of one that looks the same after quarter turns or any, x and y are stretched alike, so that it stays so.
+        fold: symmetry of the mesh; of one that looks the same after quarter turns or any, x and y are stretched alike,
+            so that it stays so.
     """
     mesh, factors = mesh.copy(), np.exp(rng.uniform(-stretch, stretch, 3))
     mesh.apply_scale(factors if fold in (1, 2) else factors[[0, 0, 2]])

@@ -50,16 +50,17 @@ def train(
         config: settings.
         data: the objects to train on.
         validation: others, to measure by.
-        directory: receives `state.msgpack`, `metrics.jsonl` and `config.json`. A run that stands there with other settings, data or
-            initial parameters is refused, except that `steps` may change.
-        initial: parameters of a network to go on from, with `config.network` that of its model; random ones by default. Clouds then are as sensors give them from the first
-            step: a network that knew one view unlearned it while clouds were complete (IoU 0.48 to 0.08 in 500 steps).
+        directory: receives `state.msgpack`, `metrics.jsonl` and `config.json`. A run that stands there with other
+            settings, data or initial parameters is refused, except that `steps` may change.
+        initial: parameters of a network to go on from, with `config.network` that of its model; random ones by default.
+            Clouds then are as sensors give them from the first step: a network that knew one view unlearned it while
+            clouds were complete (IoU 0.48 to 0.08 in 500 steps).
         progress: show a progress bar.
         workers: processes that draw batches, which do not depend on how many there are; 1 is a thread of this one.
 
     Returns:
-        The network's parameters, averaged over about the last tenth of the steps, as validation measures them: at a high learning rate
-        they are far better than the latest, so a run's state is of use at any time.
+        The network's parameters, averaged over about the last tenth of the steps, as validation measures them: at a
+        high learning rate they are far better than the latest, so a run's state is of use at any time.
 
     Raises:
         InputError: the data have too few points, or the directory holds another run or cannot be written.
@@ -121,7 +122,8 @@ def steps_within(minutes: float, config: TrainConfig, data: DataSet, workers: in
     optimiser = _optimiser(config)
     params, state = _start(config, data, optimiser, None)
     times = []
-    waiting = asked_ahead(workers)  # drawn while the first step compiles: the steps that take them do not wait for samples
+    # drawn while the first step compiles: the steps that take them do not wait for samples
+    waiting = asked_ahead(workers)
     with drawn_ahead(functools.partial(batch_of, config), data, 0, workers) as batches:
         for step in range(waiting + TIMED_STEPS):
             began = time.monotonic()
@@ -191,7 +193,8 @@ def _step(params, state, samples, step, config, optimiser):
     gradient, parts = mean_gradient(params, config, *samples)
     updates, optimisation = optimiser.update(gradient, state["optimiser"], params)
     params = optax.apply_updates(params, updates)
-    # The weight of the latest falls as 1/step, so the average reaches back over a share of the run, not over a number of steps.
+    # The weight of the latest falls as 1/step, so the average reaches back over a share of the run, not over a number
+    # of steps.
     rate = 1 / (1 + AVERAGED * step)
     average = optax.incremental_update(params, state["average"], rate)
     return params, {"optimiser": optimisation, "average": average}, parts
@@ -207,7 +210,8 @@ def _optimiser(config: TrainConfig) -> optax.GradientTransformation:
     schedule = optax.warmup_cosine_decay_schedule(0.0, 1.0, config.warmup, config.steps, 0.02)
 
     def matrices(params):
-        # A first layer of 3 channels and a read-out of 1 have nothing to orthogonalise: they go to Adam with the vectors.
+        # A first layer of 3 channels and a read-out of 1 have nothing to orthogonalise: they go to Adam with the
+        # vectors.
         muon = optax.contrib.MuonDimensionNumbers()
         return jax.tree.map(lambda leaf: muon if leaf.ndim == 2 and min(leaf.shape) >= 16 else None, params)
 

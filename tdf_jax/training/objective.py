@@ -79,13 +79,15 @@ def frame_error(
 ) -> Float[Array, ""]:
     """Squared error of the object's frame read out of a latent: up, the front as far as there is one, and the frame's origin.
 
-    Three linear read-outs (`params["frame"]`, (latent, 3), used in training only) of a latent whose vectors turn with the object: a
-    vector-neuron network has no bias, so it must find the frame in the cloud, and being equivariant it needs no
-    rotated copies for it. Without this term, an early trial could not match an object with itself after 500 steps; with it, the frame
-    is found within 200. A cloud seen from one side has its mean off the object's middle: the origin tells by how much.
+    Three linear read-outs (`params["frame"]`, (latent, 3), used in training only) of a latent whose vectors turn with
+    the object: a vector-neuron network has no bias, so it must find the frame in the cloud, and being equivariant it
+    needs no rotated copies for it. Without this term, an early trial could not match an object with itself after 500
+    steps; with it, the frame is found within 200. A cloud seen from one side has its mean off the object's middle: the
+    origin tells by how much.
 
-    A symmetric object has several fronts that are as good: the nearest counts. Asked for none, the network laid all vectors of a bowl's latent along its axis, and no
-    shape but one of revolution could be told from them (IoU of oval and square ones 0.3); asked for any, and shown clouds displaced (`NetworkConfig.asymmetry`), it tells their sides.
+    A symmetric object has several fronts that are as good: the nearest counts. Asked for none, the network laid all
+    vectors of a bowl's latent along its axis, and no shape but one of revolution could be told from them (IoU of oval
+    and square ones 0.3); asked for any, and shown clouds displaced (`NetworkConfig.asymmetry`), it tells their sides.
 
     Args:
         params: see `pair_loss`.
@@ -108,9 +110,10 @@ def place_error(
 ) -> Float[Array, ""]:
     """How badly the descriptors shown at a place of one object choose the same place of another among wrong poses.
 
-    With E_k the descriptor loss (eq. 2) of pose k, the right one first: -log(E_0^-s / sum_k E_k^-s), s = `SHARPNESS`. It asks of
-    the energy what imitation asks of it, that its minimum lie at the right pose, and does not depend on the energy's unit. A symmetric object has several right poses, and its
-    network takes one of its fronts for the front: the best of them counts.
+    With E_k the descriptor loss (eq. 2) of pose k, the right one first: -log(E_0^-s / sum_k E_k^-s), s = `SHARPNESS`.
+    It asks of the energy what imitation asks of it, that its minimum lie at the right pose, and does not depend on the
+    energy's unit. A symmetric object has several right poses, and its network takes one of its fronts for the front:
+    the best of them counts.
     """
     reference = shown_on.descriptors(shown)
     energy = jnp.mean(jnp.abs(offered_to.descriptors(offered) - reference), axis=(1, 2))
@@ -121,8 +124,9 @@ def place_error(
 def mean_gradient(params, config: NetworkConfig, *samples):
     """Gradients averaged over a batch of pairs of objects, and the loss and its parts of each.
 
-    On a CPU one pair after the other: a scan that adds up gradients holds one pair's activations at a time, and is faster there than `vmap`. Products are of the device's default precision,
-    rounded to 10 bits on some accelerators, as the shipped weights of bowls, of bottles and of all three were trained.
+    On a CPU one pair after the other: a scan that adds up gradients holds one pair's activations at a time, and is
+    faster there than `vmap`. Products are of the device's default precision, rounded to 10 bits on some accelerators,
+    as the shipped weights of bowls, of bottles and of all three were trained.
     """
     with jax.default_matmul_precision(jax.config.jax_default_matmul_precision or "default"):
         return _mean_gradient(params, config, samples)

@@ -10,8 +10,9 @@ from jaxtyping import Array, Float
 from tdf_jax._internal.errors import InputError
 from tdf_jax.networks.field import DescriptorField
 
-# Logistic in log(residual), fitted on 288 picks whose truth is known, 9 of them wrong: `tdf benchmark --seed 61 --pairs 72 --methods tdf_jax --clouds full views1 views2 noise`, mugs of
-# 0.12 m. Right picks had residuals of 0.08 to 0.53 (all but 5 % on either side, by condition), wrong ones 0.44 to 0.83. docs/certainty.md has the reliability on others.
+# Logistic in log(residual), fitted on 288 picks whose truth is known, 9 of them wrong: `tdf benchmark --seed 61 --pairs
+# 72 --methods tdf_jax --clouds full views1 views2 noise`, mugs of 0.12 m. Right picks had residuals of 0.08 to 0.53
+# (all but 5 % on either side, by condition), wrong ones 0.44 to 0.83. docs/certainty.md has the reliability on others.
 INTERCEPT, SLOPE = -3.39, 6.55
 FITTED_ON = 61  # seed
 CALIBRATED = ("mug",)  # shipped weights that it was fitted for
@@ -21,8 +22,9 @@ MOST = 0.99  # none of the 250 surest was wrong, and no more than that can be kn
 def confidence(residual: float, intercept: float = INTERCEPT, slope: float = SLOPE) -> float | None:
     """Probability that a pick with a residual is within 2 cm and 20 degrees of the truth.
 
-    By default it is calibrated for the shipped mug weights, demonstrations at the handle with query points in a box of 6 cm, and mugs of 0.12 m, complete, noisy or seen by
-    one camera or more. Elsewhere it still falls as the match gets worse, but is no probability; `tdf_jax.uncertainty.calibration.fit` fits the two numbers anew.
+    By default it is calibrated for the shipped mug weights, demonstrations at the handle with query points in a box of
+    6 cm, and mugs of 0.12 m, complete, noisy or seen by one camera or more. Elsewhere it still falls as the match gets
+    worse, but is no probability; `tdf_jax.uncertainty.calibration.fit` fits the two numbers anew.
 
     Args:
         residual: of the pick, such as `result.residual`.
@@ -47,7 +49,8 @@ def bins(predicted: Float[np.ndarray, " picks"], right: Float[np.ndarray, " pick
         right: 1 where the pick was, else 0.
 
     Returns:
-        For each bin that is not empty the number of picks, the mean confidence, the share that was right and its 95 % interval (Wilson).
+        For each bin that is not empty the number of picks, the mean confidence, the share that was right and its 95 %
+        interval (Wilson).
     """
     number = np.searchsorted(EDGES[1:-1], predicted, side="right")
     rows = []
@@ -116,8 +119,9 @@ POINTS = 1500  # of the cloud that are looked at: one size, so that clouds of al
 CUT = 3.0  # occupancy logits beyond it count no further: a few stray points must not decide
 
 
-# Logistic in (-log residual, surface logit), by name of shipped weights: intercept and two slopes, fitted on right and wrong cases of seed 61 by
-# `python -m bench.recognition --fit`: 40 of each for mugs, 32 for bowls and for bottles, 48 for all three. Tried on others: docs/certainty.md.
+# Logistic in (-log residual, surface logit), by name of shipped weights: intercept and two slopes, fitted on right and
+# wrong cases of seed 61 by `python -m bench.recognition --fit`: 40 of each for mugs, 32 for bowls and for bottles, 48
+# for all three. Tried on others: docs/certainty.md.
 CURVES = {
     "mug": (-2.77, 6.25, 4.76),
     "bowl": (-28.5, 16.9, -2.35),
@@ -129,7 +133,8 @@ CURVES = {
 def surface_logit(field: DescriptorField, points: Float[Array, "points 3"]) -> float:
     """Mean logit of the occupancy at an object's own points, each cut to [-3, 3].
 
-    Points of an object that the network knows lie on its surface of occupancy 1/2, logit 0; of others they come to lie outside.
+    Points of an object that the network knows lie on its surface of occupancy 1/2, logit 0; of others they come to lie
+    outside.
 
     Args:
         field: the object's.
@@ -152,7 +157,8 @@ def recognition(
 ) -> float | None:
     """Probability that an object is of the category of a demonstration, if both were equally likely before.
 
-    By default it is fitted for the shipped mug weights: mugs against bowls and bottles, demonstrated at the handle with query points in a box of 6 cm, complete, noisy or seen by one camera or more.
+    By default it is fitted for the shipped mug weights: mugs against bowls and bottles, demonstrated at the handle with
+    query points in a box of 6 cm, complete, noisy or seen by one camera or more.
 
     Args:
         residual: what the pick leaves unmatched, see `tdf_jax.confidence`.

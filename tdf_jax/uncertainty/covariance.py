@@ -14,19 +14,21 @@ from tdf_jax.energy.reference import Reference
 from tdf_jax.geometry import se3 as poses
 from tdf_jax.networks.field import DescriptorField
 
-# The rise of the energy that counts as one sigma. Of 18 handles found on generated mugs the squared normalised errors were 6.6 on average and
-# 4.7 in the median; 6 and 5.3 are those of six normal numbers. Nearly all of it is of moves: 6.3 of 3, and 0.16 of 3 of turns.
+# The rise of the energy that counts as one sigma. Of 18 handles found on generated mugs the squared normalised errors
+# were 6.6 on average and 4.7 in the median; 6 and 5.3 are those of six normal numbers. Nearly all of it is of moves:
+# 6.3 of 3, and 0.16 of 3 of turns.
 SCALE = 1e-4
 
 
-# Below this share of the stiffest direction's curvature a direction is free. The turn about a cup's axis had at most 0.001 where the cloud had the symmetry exactly, and
-# 0.008 to 0.016 at handle and rim, 0.02 to 0.03 at the base, where it was sampled at random; on mugs the softest direction had
-# 0.05 at the handle, 0.08 at the rim, 0.15 at the base, or more.
+# Below this share of the stiffest direction's curvature a direction is free. The turn about a cup's axis had at most
+# 0.001 where the cloud had the symmetry exactly, and 0.008 to 0.016 at handle and rim, 0.02 to 0.03 at the base, where
+# it was sampled at random; on mugs the softest direction had 0.05 at the handle, 0.08 at the rim, 0.15 at the base, or
+# more.
 FREE = 0.03
 
 
-# Passes of the fit, and the share by which a pass may still change one sigma. The field of a mug takes three or four; a random network, on which the stiffest direction is
-# 100 times as stiff as the softest in sigma, takes the most.
+# Passes of the fit, and the share by which a pass may still change one sigma. The field of a mug takes three or four; a
+# random network, on which the stiffest direction is 100 times as stiff as the softest in sigma, takes the most.
 PASSES, SETTLED = 8, 0.01
 FIRST_TURN, LARGEST_TURN = np.radians(5), np.radians(15)  # of the steps, which are lengths: turns times the lever
 LARGEST_SIGMA = 1.0  # radians, times the lever: what a direction without any curvature gets
@@ -46,7 +48,8 @@ class Screw:
     Attributes:
         direction: of the axis, unit vector, world frame; its sign means nothing.
         point: on the axis, the one nearest the query points' mean, metres, world frame.
-        pitch: metres along the axis for one radian about it: 0 of a pure turn, infinite of a pure move, whose `point` is the mean itself.
+        pitch: metres along the axis for one radian about it: 0 of a pure turn, infinite of a pure move, whose `point`
+            is the mean itself.
     """
 
     direction: Float[np.ndarray, "3"]
@@ -65,12 +68,15 @@ class PoseCovariance:
 
     Attributes:
         curvature: H of E(twist) = E(0) + twist' H twist / 2; energy over radians and metres.
-        covariance: 2 `scale` H^-1: one sigma along any axis of the ellipsoid raises the energy by `scale`. It is nowhere more
-            than 1 radian times the lever, which is also what directions get along which the energy does not rise at all.
+        covariance: 2 `scale` H^-1: one sigma along any axis of the ellipsoid raises the energy by `scale`. It is
+            nowhere more than 1 radian times the lever, which is also what directions get along which the energy does
+            not rise at all.
         values: curvatures along `directions`, rising, energy / m^2: per metre of move, or of turn times the lever.
-        directions: twists in rows, of length 1 m if turns are multiplied by the lever, and at right angles to each other in that measure.
+        directions: twists in rows, of length 1 m if turns are multiplied by the lever, and at right angles to each
+            other in that measure.
         centre: the query points' mean at the pose, metres, world frame.
-        lever: root mean square distance of the query points from their mean, metres: what a turn of one radian moves them by, in round numbers.
+        lever: root mean square distance of the query points from their mean, metres: what a turn of one radian moves
+            them by, in round numbers.
         scale: rise of the energy that counts as one sigma.
     """
 
@@ -110,12 +116,16 @@ def pose_covariance(
 ) -> PoseCovariance:
     """Curvature of a waypoint's descriptor energy at a pose that was found, and the covariance that follows.
 
-    The energy is a mean of absolute values: with kinks, and near a perfect match a cone. Its second derivatives say little, so the curvature is a secant: it is
-    fitted to rises of the energy, each the mean of a step and its opposite, which the slope left at the pose cancels out of. The steps are along six axes and their pairs'
-    diagonals, the axes those of the ellipsoid that the pass before found, as long as raises the energy by `scale`, or 15 degrees times the lever if that is less.
+    The energy is a mean of absolute values: with kinks, and near a perfect match a cone. Its second derivatives say
+    little, so the curvature is a secant: it is fitted to rises of the energy, each the mean of a step and its opposite,
+    which the slope left at the pose cancels out of. The steps are along six axes and their pairs' diagonals, the axes
+    those of the ellipsoid that the pass before found, as long as raises the energy by `scale`, or 15 degrees times the
+    lever if that is less.
 
-    It says which directions are certain and which are not on one object; how much the shapes of two objects differ it cannot know. On 18 handles of generated mugs the root of
-    the summed variances was 5.5 degrees and 3.4 mm in the median, the errors 1.2 degrees and 4.6 mm: turns were better, and moves along the handle, up to 12 mm, worse than it says.
+    It says which directions are certain and which are not on one object; how much the shapes of two objects differ it
+    cannot know. On 18 handles of generated mugs the root of the summed variances was 5.5 degrees and 3.4 mm in the
+    median, the errors 1.2 degrees and 4.6 mm: turns were better, and moves along the handle, up to 12 mm, worse than it
+    says.
 
     Args:
         field: the new object's.
@@ -125,10 +135,12 @@ def pose_covariance(
         scale: rise of the energy that counts as one sigma; traced.
 
     Returns:
-        The covariance. Like the pose it is of the world frame, and it turns with object and pose. Works under `jax.vmap` and `jax.jit`.
+        The covariance. Like the pose it is of the world frame, and it turns with object and pose. Works under
+        `jax.vmap` and `jax.jit`.
 
     Raises:
-        InputError: a pose that is not seven finite numbers with a rotation, a waypoint that is none, a scale that is not above zero, or query points all at one place.
+        InputError: a pose that is not seven finite numbers with a rotation, a waypoint that is none, a scale that is
+            not above zero, or query points all at one place.
     """
     pose = jnp.asarray(pose, reference.query.dtype)
     _check("pose_covariance()", reference, pose, waypoint, scale)
@@ -179,8 +191,9 @@ def _covariance(field, query, descriptors, pose, scale):
         energies = jax.lax.map(energy, jnp.concatenate([along, -along])).reshape(2, -1)
         rises = jnp.mean(energies, axis=0) - start
         sums, differences = jnp.split(rises[6:], 2)
-        # A least squares fit to all rises would mix those of the diagonals into the curvatures: a cone rises along a free axis plus another by 1 / sqrt(2) instead
-        # of 1 / 2, and free axes came out at 0.004 to 0.01 of the stiffest instead of under 0.001.
+        # A least squares fit to all rises would mix those of the diagonals into the curvatures: a cone rises along a
+        # free axis plus another by 1 / sqrt(2) instead of 1 / 2, and free axes came out at 0.004 to 0.01 of the
+        # stiffest instead of under 0.001.
         mixed = jnp.zeros((6, 6), rises.dtype).at[_FIRST, _SECOND].set(sums - differences)
         matrix = (jnp.diag(2 * rises[:6]) + mixed + mixed.T) / (lengths[:, None] * lengths)
         values, rotated = jnp.linalg.eigh(matrix)

@@ -1,7 +1,8 @@
 """Alternatives and certainty: which distinct poses the starts came to, and how sharply the energy determines one of them.
 
-Small motions of a pose are twists: a turn (a rotation vector, radians) about the mean of the query points, and a move of it (metres), both along the world's
-axes, six numbers (turn, move). They act as screws: a twist (w, w x (c - a)), with c the mean, is exactly a turn about the axis w through a, at any angle.
+Small motions of a pose are twists: a turn (a rotation vector, radians) about the mean of the query points, and a move
+of it (metres), both along the world's axes, six numbers (turn, move). They act as screws: a twist (w, w x (c - a)),
+with c the mean, is exactly a turn about the axis w through a, at any angle.
 """
 
 import dataclasses
@@ -11,8 +12,9 @@ from jaxtyping import Array, Float, Int
 
 from tdf_jax._internal.errors import InputError
 
-# Radians and metres within which starts count as one mode. At their minima, starts that came to one pose were within 0.4 degrees and 0.1 mm of each other on generated
-# mugs; starts that are still on their way, such as finalists after 4 polishing steps, lie 5 to 90 degrees from it, and no bound tells them from modes.
+# Radians and metres within which starts count as one mode. At their minima, starts that came to one pose were within
+# 0.4 degrees and 0.1 mm of each other on generated mugs; starts that are still on their way, such as finalists after 4
+# polishing steps, lie 5 to 90 degrees from it, and no bound tells them from modes.
 SAME_ANGLE, SAME_DISTANCE = np.radians(15), 0.02
 
 
@@ -38,12 +40,13 @@ def cluster_poses(
 ) -> list[Mode]:
     """The distinct poses among those that several starts came to.
 
-    From the least energy upwards, a start joins the first mode whose `pose` is near it in both turn and distance, or else begins one. Starts of equal energy
-    are taken in their order.
+    From the least energy upwards, a start joins the first mode whose `pose` is near it in both turn and distance, or
+    else begins one. Starts of equal energy are taken in their order.
 
-    The starts have to be at their minima, or they are counted where they happen to be: of six finalists on generated mugs `solve` with its 4 polishing steps left 1 to 6
-    modes, and with 60 one, in 4 of 18 cases two, the other about half a turn away. Where the
-    energy leaves a direction free (`pose_covariance`), starts anywhere along it are modes of their own, of equal energies.
+    The starts have to be at their minima, or they are counted where they happen to be: of six finalists on generated
+    mugs `solve` with its 4 polishing steps left 1 to 6 modes, and with 60 one, in 4 of 18 cases two, the other about
+    half a turn away. Where the energy leaves a direction free (`pose_covariance`), starts anywhere along it are modes
+    of their own, of equal energies.
 
     Args:
         wxyz_xyz: one pose of each start, such as the picks `result.trajectories[:, 0]`, T_world_query, metres.
@@ -52,7 +55,8 @@ def cluster_poses(
         distance: largest distance between their translations, metres.
 
     Returns:
-        The modes by rising energy. Starts whose pose or energy is not finite belong to none; without a finite one the list is empty.
+        The modes by rising energy. Starts whose pose or energy is not finite belong to none; without a finite one the
+        list is empty.
 
     Raises:
         InputError: poses and energies that do not fit together, a quaternion of length zero, or a negative bound.
@@ -79,7 +83,8 @@ def cluster_poses(
     left, modes = finite[np.argsort(energies[finite], kind="stable")], []
     while len(left):
         best = left[0]
-        # q and -q are one rotation; the chord between unit quaternions is 2 sin(angle / 4), which is exact for small angles as an arc cosine is not.
+        # q and -q are one rotation; the chord between unit quaternions is 2 sin(angle / 4), which is exact for small
+        # angles as an arc cosine is not.
         chords = np.minimum(*(np.linalg.norm(wxyz[left] + sign * wxyz[best], axis=1) for sign in (-1, 1)))
         near = (4 * np.arcsin(np.minimum(chords / 2, 1)) <= angle) & (np.linalg.norm(xyz[left] - xyz[best], axis=1) <= distance)
         members, left = left[near], left[~near]

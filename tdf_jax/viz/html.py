@@ -40,8 +40,8 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
         title: of the page.
 
     Raises:
-        InputError: the grid has one axis, each rotation was kept, plotly (or, for a volume, libigl) is not installed, or the file cannot
-            be written.
+        InputError: the grid has one axis, each rotation was kept, plotly (or, for a volume, libigl) is not installed,
+            or the file cannot be written.
     """
     plotly = pages("save_page()")
     grid = landscape.grid

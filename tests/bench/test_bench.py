@@ -87,7 +87,8 @@ def test_descents_agree_and_the_tuned_peer_evaluates_the_fixed_pose_once(golden,
         assert result["losses"].shape == (2, 3)
         for name in ("losses", "energies"):
             assert relative_error(result[name], expected[name]) < 1e-3
-    assert np.asarray(expected["losses"])[0, 0] != pytest.approx(np.asarray(expected["losses"])[0, 2], rel=1e-3)  # it moves
+    # it moves
+    assert np.asarray(expected["losses"])[0, 0] != pytest.approx(np.asarray(expected["losses"])[0, 2], rel=1e-3)
 
 
 def test_operations_are_those_of_the_folded_network():
@@ -255,7 +256,8 @@ def quick(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bench")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
-        patch.setenv("OMP_NUM_THREADS", "1")  # threads that wait for each other would lose most of the time to the other tests
+        # threads that wait for each other would lose most of the time to the other tests
+        patch.setenv("OMP_NUM_THREADS", "1")
         assert command_line.main(["--quick", "--repetitions", "1", "--scaling", "--out", str(folder)]) == 0
     return folder
 

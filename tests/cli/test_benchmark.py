@@ -82,7 +82,8 @@ def test_the_record_has_every_task_by_every_method_and_the_settings(folder, weig
     ]
     assert [(row["method"], row["tasks"], row["objects"]) for row in record["rows"]] == [(method, 2, 2) for method in METHODS]
     for one in record["tasks"]:
-        assert len(one["distances"]) == 7 and one["distances"][-1] < 1e-5 and one["angles"][-1] < 0.1  # the goal is given
+        # the goal is given
+        assert len(one["distances"]) == 7 and one["distances"][-1] < 1e-5 and one["angles"][-1] < 0.1
         assert (one["confidence"] is not None) == (one["method"] == "tdf_jax")
     assert record["settings"] | {"pairs": 2, "seed": 0, "height": 0.12, "clouds": ["full"], "weights": str(weights), "demonstrations": []} == record["settings"]
     assert record["weights"] == {"name": "small", "source": "a test"} and "demonstrations" not in record

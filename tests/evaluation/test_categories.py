@@ -222,7 +222,8 @@ def test_a_summary_tells_symmetries_apart(bottles):
     assert row["by_symmetry"]["two-fold"]["success_2cm_20deg"] == 0 and row["by_symmetry"]["four-fold"]["iou"] is None
     told = scores.by_symmetry(row)
     assert told[0] == ["round", "2", "0.800", "0.800", "50 %", "50 %", "100 %", "50 %"]
-    assert told[2] == ["four-fold", "1", "n/a", "n/a", "0 %", "0 %", "0 %", "100 %"]  # at its place and upright, but turned
+    # at its place and upright, but turned
+    assert told[2] == ["four-fold", "1", "n/a", "n/a", "0 %", "0 %", "0 %", "100 %"]
     alike = summary(np.zeros(2), np.zeros(2), {"iou": [0.9, 0.9]}, [bottles[1]] * 2)
     assert list(alike["by_symmetry"]) == ["none"] and scores.by_symmetry(alike) == []
 

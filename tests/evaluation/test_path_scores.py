@@ -153,7 +153,8 @@ def test_directions_are_uniform_and_depend_on_seed_and_index_alone(case):
     np.testing.assert_array_equal(make_task(case, SEED, 7).goal, make_task(case, SEED, 7).goal)
     ways = np.stack([way(seed, index) for seed in range(10) for index in (6, 30, 54, 78)])
     assert cKDTree(ways).query(ways, k=2)[0][:, 1].min() > 1e-3  # no two are the same
-    # Of 40 uniform directions: the mean is of 0.16 a length that is exceeded by 0.4 in fewer than 1 in 1000; second moments are a third.
+    # Of 40 uniform directions: the mean is of 0.16 a length that is exceeded by 0.4 in fewer than 1 in 1000; second
+    # moments are a third.
     assert np.linalg.norm(ways.mean(axis=0)) < 0.4
     assert np.all(np.abs(np.linalg.eigvalsh(ways.T @ ways / 40) - 1 / 3) < 0.25)
 
@@ -564,7 +565,8 @@ def test_open_meshes_have_no_penetration_wherever_a_path_is(task, metres):
     mesh = task.case.object_b.mesh.copy()
     mesh.update_faces(np.random.default_rng(1).random(len(mesh.faces)) < 0.5)
     opened = dataclasses.replace(task, case=dataclasses.replace(task.case, object_b=annotated(task.case.object_b, mesh)))
-    query = jnp.asarray(np.random.default_rng(0).uniform(-0.04, 0.04, (300, 3)), jnp.float32)  # enough to tell that it is open
+    # enough to tell that it is open
+    query = jnp.asarray(np.random.default_rng(0).uniform(-0.04, 0.04, (300, 3)), jnp.float32)
     opened = dataclasses.replace(opened, demonstration=dataclasses.replace(task.demonstration, query=query))
     away = displaced(perfect(task)[0], [metres, 0, 0])
     assert score("PCA", Attempt(away[None], np.zeros(1), 0.0), opened).penetration is None
@@ -603,7 +605,8 @@ def test_a_start_that_became_non_finite_spoils_nothing(task):
         found = score("TDF, l_p", Attempt(paths, np.array([np.nan, 1.0, 2.0, 3.0]), 0.0), task)
         lost = score("TDF, l_p", Attempt(paths[:1], np.array([np.nan]), 0.0, np.nan), task)
     assert found == dataclasses.replace(score("TDF, l_p", Attempt(paths[1:], np.array([1.0, 2.0, 3.0]), 0.0), task), starts=4)
-    json.dumps(dataclasses.asdict(lost), allow_nan=False)  # a task that is lost altogether is a failure that can be told
+    # a task that is lost altogether is a failure that can be told
+    json.dumps(dataclasses.asdict(lost), allow_nan=False)
     assert not lost.succeeds(0.05, 30)
 
 
@@ -796,7 +799,8 @@ def test_the_residual_of_the_demonstrated_object_itself_is_0(model, task, values
 def test_confidence_falls_as_the_match_gets_worse_and_is_a_probability():
     residuals = (0.0, 1e-12, 1e-3, *np.geomspace(0.05, 1e2, 30))
     found = [sure.confidence(one) for one in residuals]
-    assert found[0] == max(found) == 0.99 and found[-1] < 0.05 and min(found) >= 0  # of 288 picks it was fitted on, none can be surer
+    # of 288 picks it was fitted on, none can be surer
+    assert found[0] == max(found) == 0.99 and found[-1] < 0.05 and min(found) >= 0
     assert all(a >= b for a, b in zip(found, found[1:]))
     less = [one for one in found if one < 0.99]
     assert len(less) > 10 and all(a > b for a, b in zip(less, less[1:]))

@@ -37,7 +37,8 @@ def test_the_expected_trajectory_goes_from_the_carried_pick_to_the_goal():
     np.testing.assert_allclose(expected.wxyz_xyz[-1], goal, atol=1e-6)
     turns = poses.rotation_distance(expected.rotations, jnp.eye(3)[None])
     np.testing.assert_allclose(turns, np.linspace(np.pi / 2, 0, 5), atol=1e-6)
-    # Half way: the mean of where the pick's motion (x, y -> -y, x + ...) and the goal's (0.3 m up) carry (0.05, 0.2, 0).
+    # Half way: the mean of where the pick's motion (x, y -> -y, x + ...) and the goal's (0.3 m up) carry (0.05, 0.2,
+    # 0).
     np.testing.assert_allclose(expected.translations[2], (np.array([-0.2, 0.07, 0.2]) + [0.05, 0.2, 0.3]) / 2, atol=1e-6)
 
 

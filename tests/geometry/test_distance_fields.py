@@ -70,7 +70,8 @@ def test_gradients_are_finite_where_distances_have_kinks():
     at = jnp.asarray([[0, 0, 0], [0.01, 0.02, 0], [0.05, 0, 0], [0.05, 0.1, 0], [0.05, 0.1, 0.02], [0.2, 0.1, 0.02]])
     found = np.asarray(gradients(box, at))
     assert np.isfinite(found).all()
-    # The middle of a wall pushes out by one of its sides, and a side straight out: a gradient of zero would keep a motion where it is.
+    # The middle of a wall pushes out by one of its sides, and a side straight out: a gradient of zero would keep a
+    # motion where it is.
     np.testing.assert_allclose(np.abs(found[:3]), [[0, 0, 1], [0, 0, 1], [1, 0, 0]], atol=1e-6)
     grid = DistanceGrid(jnp.zeros(3), jnp.array(0.5), jnp.asarray(np.random.default_rng(0).normal(size=(3, 3, 3)), jnp.float32))
     assert np.isfinite(gradients(grid, jnp.asarray([[0.5, 0.5, 0.5], [1.0, 0.2, 0.2], [1.0, 1.0, 1.0], [0.0, 0.0, -1.0]]))).all()
@@ -99,7 +100,8 @@ def test_a_mesh_is_tabulated_to_a_part_of_the_pitch():
         assert np.abs(error).max() < 0.87 * pitch and np.abs(error).mean() < 0.06 * pitch
     far = place + [0.5, 0, 0]
     beyond = np.asarray(obstacle.distance(jnp.asarray(carried(pose, far)))) - box_distance(far)
-    assert beyond.min() > -1e-5 and beyond.max() < 0.1  # never less than true, and nowhere more than the way through the grid
+    # never less than true, and nowhere more than the way through the grid
+    assert beyond.min() > -1e-5 and beyond.max() < 0.1
 
 
 def test_an_open_mesh_and_one_inside_out_have_the_sides_they_ought_to():
@@ -153,7 +155,8 @@ def test_distances_to_a_field_are_those_to_the_mug(mug):
 
 def test_a_field_without_a_surface_near_the_points_is_refused(mug, monkeypatch):
     _, _, points, field = mug
-    monkeypatch.setattr(occupied, "_excess", lambda field, x: 0.005 - jnp.linalg.norm(x - points.mean(axis=0), axis=-1))  # a pea in the hollow
+    # a pea in the hollow
+    monkeypatch.setattr(occupied, "_excess", lambda field, x: 0.005 - jnp.linalg.norm(x - points.mean(axis=0), axis=-1))
     with pytest.raises(InputError, match=r"field_obstacle\(\): of \d+ solid pieces none lies within 0.015 m"):
         field_obstacle(field, points, pitch=0.005)
 

@@ -76,7 +76,8 @@ def test_a_turned_copy_is_turned_back_as_far_as_the_symmetry_allows(fold):
 def test_heights_do_not_count_but_distances_from_the_axis_do():
     """Far points outweigh near ones, as they move further; points on the axis say nothing."""
     truth = np.array([[1.0, 0, 0], [0.1, 0, 0], [0.1, 0, 0], [0, 0, 0]])
-    found = np.array([[0.0, 1, 3], [-0.1, 0, -2], [-0.1, 0, 0], [0, 0, 9]])  # the far one by a quarter, the near ones by a half
+    # the far one by a quarter, the near ones by a half
+    found = np.array([[0.0, 1, 3], [-0.1, 0, -2], [-0.1, 0, 0], [0, 0, 9]])
     np.testing.assert_allclose(np.degrees(nearest_turn(found, truth, ROUND)), 90, atol=2)
     np.testing.assert_allclose(np.degrees(nearest_turn(found, truth, 4)), 90)
 

@@ -62,7 +62,8 @@ def test_a_step_costs_the_mean_of_both_ends():
     np.testing.assert_allclose(lowest_cost_path(of(grid, energy), (0, 0, 0), (0.2, 0, 0))[1], (0.1, 0.1, 0))
     energy[1, 0] = 1.7  # straight: 2 x 1.35, though entering (0.1, 0) at its own price would cost 1.7 + 1
     np.testing.assert_allclose(lowest_cost_path(of(grid, energy), (0, 0, 0), (0.2, 0, 0))[1], (0.1, 0, 0))
-    energy[1, 0], energy[0, 0] = 1.95, 0.5  # leaving counts too: (0.5 + 1.95) / 2 + (1.95 + 1) / 2 against 1.414 x (0.75 + 1)
+    # leaving counts too: (0.5 + 1.95) / 2 + (1.95 + 1) / 2 against 1.414 x (0.75 + 1)
+    energy[1, 0], energy[0, 0] = 1.95, 0.5
     np.testing.assert_allclose(lowest_cost_path(of(grid, energy), (0, 0, 0), (0.2, 0, 0))[1], (0.1, 0.1, 0))
 
 

@@ -34,7 +34,8 @@ def test_the_soft_least_lies_between_the_least_and_the_mean(landscape):
     soft = dataclasses.replace(landscape, reduce="soft_least", temperature=0.01)
     np.testing.assert_allclose(soft.combined, -0.01 * np.log(np.mean(np.exp(-soft.values / 0.01), axis=0)))
     least, mean = landscape.combined, dataclasses.replace(landscape, reduce="mean").combined
-    np.testing.assert_allclose(dataclasses.replace(soft, temperature=1e-9).combined, least, atol=1e-8)  # and does not overflow
+    # and does not overflow
+    np.testing.assert_allclose(dataclasses.replace(soft, temperature=1e-9).combined, least, atol=1e-8)
     np.testing.assert_allclose(dataclasses.replace(soft, temperature=1e3).combined, mean, rtol=1e-4)
     assert ((least < soft.combined) & (soft.combined < mean)).all()
 

@@ -196,7 +196,8 @@ def noisy(latent, turns, seed):
 
 @pytest.mark.parametrize(("turns", "kept"), [
     ([0.0] * 8, "11111111"),
-    ([0, 3, -4, 2, 5, 0, -3, 1], "11111111"),  # of an object without symmetry: they differ by how well its frame is found
+    # of an object without symmetry: they differ by how well its frame is found
+    ([0, 3, -4, 2, 5, 0, -3, 1], "11111111"),
     ([0, 180, 180, 0, 180, 180, 0, 180], "01101101"),  # a flat bottle's two sides: those that are more
     ([0, 90, 180, 270, 0, 90, 0, 180], "10001010"),
     ([200, 0], "10"),  # of as many, the first

@@ -231,7 +231,8 @@ def test_errors_are_measured_against_the_true_path():
 
 
 def test_the_path_error_sees_the_corners_that_few_poses_cut():
-    path = np.stack([np.linspace(0, 2, 61), np.abs(np.linspace(-1, 1, 61)), np.zeros(61)], axis=1)  # a V: its corner at (1, 0)
+    # a V: its corner at (1, 0)
+    path = np.stack([np.linspace(0, 2, 61), np.abs(np.linspace(-1, 1, 61)), np.zeros(61)], axis=1)
     three, two = np.zeros((3, 7)), np.zeros((2, 7))
     three[:, 4:], two[:, 4:] = path[[0, 30, 60]], path[[0, 60]]
     assert made(found=three, path=path).path_error < 1e-12

@@ -90,7 +90,8 @@ def test_a_box_across_a_line_is_passed_by_the_near_side():
     assert clearance(LINE, BODY, [IN_THE_WAY]).least < -0.01
     cleared = push_clear(LINE, BODY, [IN_THE_WAY])
     assert_clear(cleared, LINE, [IN_THE_WAY])
-    # The box reaches 2 cm to the left and 4 cm to the right of the line, the cube 2 cm: 5 cm of shift are enough on the left.
+    # The box reaches 2 cm to the left and 4 cm to the right of the line, the cube 2 cm: 5 cm of shift are enough on the
+    # left.
     assert 0.049 < cleared.deviation < 0.058
     assert np.asarray(cleared.trajectory.translations)[3, 0] < -0.045
     again = push_clear(LINE, BODY, [IN_THE_WAY])
@@ -150,7 +151,8 @@ def test_a_moved_scene_moves_the_result():
     moved = box_obstacle(box[4:], IN_THE_WAY.size, box[:4])
     here = push_clear(LINE, BODY, [IN_THE_WAY]).trajectory
     path = LINE.transformed(jnp.asarray(motion, jnp.float32))
-    path = tdf.Trajectory(path.wxyz_xyz * jnp.asarray([-1, -1, -1, -1, 1, 1, 1]))  # the same rotations; what is kept is kept as it is written
+    # the same rotations; what is kept is kept as it is written
+    path = tdf.Trajectory(path.wxyz_xyz * jnp.asarray([-1, -1, -1, -1, 1, 1, 1]))
     cleared = push_clear(path, BODY, [moved])
     ends_kept(cleared, path)
     there = cleared.trajectory

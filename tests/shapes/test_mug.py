@@ -167,7 +167,8 @@ def test_the_fold_is_the_symmetry_of_the_clay(category, change, fold):
     if fold:
         assert differs(np.pi / fold) > 0.02
     else:
-        assert max(differs(angle) for angle in rng.uniform(-np.pi, np.pi, 4)) < 0.03  # between corners: a bowl's wall is thin
+        # between corners: a bowl's wall is thin
+        assert max(differs(angle) for angle in rng.uniform(-np.pi, np.pi, 4)) < 0.03
 
 
 @pytest.mark.parametrize("category, seeds", [("mug", range(3)), ("bowl", range(12)), ("bottle", range(20))])

@@ -162,7 +162,8 @@ def test_energies_are_those_of_the_trajectories_and_the_first_is_the_best(result
     np.testing.assert_allclose(result.energies, energy_of(result.trajectories, field, reference), rtol=1e-5)
     np.testing.assert_allclose(result.losses[:, -3], energy_of(result.starts, field, reference), rtol=1e-5)
     assert result.best == 0 and result.energies[0] <= result.energies[1]
-    for stage in (slice(0, 3), slice(3, 5), slice(5, 7), slice(7, 10)):  # energies of one set of query points do not rise
+    # energies of one set of query points do not rise
+    for stage in (slice(0, 3), slice(3, 5), slice(5, 7), slice(7, 10)):
         assert (np.diff(result.losses[:, stage], axis=1) <= 1e-7).all()
     assert (result.energies <= result.losses[:, -1] + 1e-7).all()
 

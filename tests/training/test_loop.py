@@ -61,7 +61,8 @@ def train(sets, quick_compilation):
         patch.setattr(loop, "_optimiser", functools.cache(loop._optimiser))
         patch.setattr(loop, "TRANSFER", OptimizeConfig(inits=2, iterations=2))
         patch.setattr("tdf_jax.training.batch.SPARSE_CLOUDS", (40, 300))
-        patch.setattr("tdf_jax.training.batch.DIAGONALS", (0.12, 0.25))  # half a metre is too much for so small a network
+        # half a metre is too much for so small a network
+        patch.setattr("tdf_jax.training.batch.DIAGONALS", (0.12, 0.25))
         yield lambda config, directory, data=sets, **options: loop.train(config, *data, directory, progress=False, **options)
 
 
@@ -214,7 +215,8 @@ def test_a_run_may_go_on_from_weights(train, whole, tmp_path):
     train(dataclasses.replace(CONFIG, steps=4, corruption=0.0), tmp_path, initial=whole[1])
     assert_same(whole[1], before)  # still there, and as they were
     first, fresh = metrics(tmp_path)[0], metrics(whole[0])[0]  # of the same objects
-    # 40 steps of so small a network amplify rounding: with sums in another order the first ratio was 0.98 instead of 0.94, the second 0.004 for 0.04.
+    # 40 steps of so small a network amplify rounding: with sums in another order the first ratio was 0.98 instead of
+    # 0.94, the second 0.004 for 0.04.
     assert first["bce"] < fresh["bce"]
     assert first["frame"] < 0.3 * fresh["frame"]
 
@@ -234,7 +236,8 @@ def test_minutes_become_steps(sets, monkeypatch):
     clock = iter(np.arange(0, 1000, 0.5))
     monkeypatch.setattr(loop.time, "monotonic", lambda: next(clock))
     monkeypatch.setattr(loop, "_step", lambda params, state, *_: (params, state, None))
-    assert loop.steps_within(10, CONFIG, sets[0], 1) == loop.steps_within(10, CONFIG, sets[0]) == 1080  # 0.5 s a step by that clock, nine tenths of the time
+    # 0.5 s a step by that clock, nine tenths of the time
+    assert loop.steps_within(10, CONFIG, sets[0], 1) == loop.steps_within(10, CONFIG, sets[0]) == 1080
     with pytest.raises(InputError, match=r"0.01 minutes are enough for 1 steps of 0.50 s; expected time for more than 2"):
         loop.steps_within(0.01, CONFIG, sets[0])
 

@@ -201,7 +201,8 @@ def test_where_the_energy_falls_the_curvature_is_negative_and_the_direction_coun
 @pytest.mark.parametrize(
     ("twist", "direction", "point", "pitch"),
     [
-        ((0, 0, 2, 0, -0.2, 0), (0, 0, 1), (0.2, 0.3, 0.1), 0),  # a turn about an axis 0.1 m away along -x, see the test
+        # a turn about an axis 0.1 m away along -x, see the test
+        ((0, 0, 2, 0, -0.2, 0), (0, 0, 1), (0.2, 0.3, 0.1), 0),
         ((0, 0, 2, 0, -0.2, 0.5), (0, 0, 1), (0.2, 0.3, 0.1), 0.25),
         ((0, 0, 0, 0, 0.6, 0.8), (0, 0.6, 0.8), (0.1, 0.3, 0.1), np.inf),
     ],
