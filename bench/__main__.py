@@ -57,8 +57,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _options(arguments):
     parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, metavar="DIR", help="write bench.json, bench.md and plots here")
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="these rows, such as encode_1500 step_10 target landscape train")
-    parser.add_argument("--repetitions", type=int, default=5, help="of every competitor, after a first call (default: 5)")
+    parser.add_argument(
+        "--only", nargs="+", metavar="NAME", help="these rows, such as encode_1500 step_10 target landscape train"
+    )
+    parser.add_argument(
+        "--repetitions", type=int, default=5, help="of every competitor, after a first call (default: 5)"
+    )
     parser.add_argument("--quick", action="store_true", help="small sizes, to test the machinery")
     parser.add_argument("--gate", action="store_true", help="compare with the baseline")
     parser.add_argument("--baseline", type=Path, default=BASELINE, metavar="FILE", help="default: bench/baseline.json")
@@ -80,14 +84,24 @@ def _run(options):
     record = {"machine": machine(), "quick": options.quick}
     print("machine:", ", ".join(f"{name} {value}" for name, value in record["machine"].items()), flush=True)
     if record["machine"]["load"] > BUSY_LOAD and not options.quick:
-        print(f"warning: the load is {record['machine']['load']}: other processes run; measure on an idle machine", file=sys.stderr)
+        print(
+            f"warning: the load is {record['machine']['load']}: other processes run; measure on an idle machine",
+            file=sys.stderr,
+        )
     state = scene.weights(tdf.load_model("mug"))
     with Workers() as workers:
         record["parity"] = parity(workers, **(QUICK_ENERGIES if options.quick else {}))
-        print(f"parity: {sum(one['passed'] for one in record['parity'])} of {len(record['parity'])} checks passed", flush=True)
+        print(
+            f"parity: {sum(one['passed'] for one in record['parity'])} of {len(record['parity'])} checks passed",
+            flush=True,
+        )
         correct = all(one["passed"] for one in record["parity"])
         record["matmul_gflops"] = matmul_gflops(workers, state)
-        print("matmul peak, GFLOP/s:", ", ".join(f"{name} {rate:.0f}" for name, rate in record["matmul_gflops"].items()), flush=True)
+        print(
+            "matmul peak, GFLOP/s:",
+            ", ".join(f"{name} {rate:.0f}" for name, rate in record["matmul_gflops"].items()),
+            flush=True,
+        )
         record["rows"] = {}
         for row in selected if correct else ():  # what is wrong is not timed
             record["rows"][row.name] = measure(row, workers, state, options.repetitions)
@@ -126,7 +140,9 @@ def _folder(path):
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"bench: cannot write to {path} ({error}); expected a folder, or a name for a new one") from None
+        raise InputError(
+            f"bench: cannot write to {path} ({error}); expected a folder, or a name for a new one"
+        ) from None
 
 
 if __name__ == "__main__":

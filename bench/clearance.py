@@ -21,7 +21,11 @@ def scene(seed: int, body):
         boxes = []
         for _ in range(3):
             wxyz = rng.normal(size=4)
-            boxes.append(box_obstacle(path.translations[rng.integers(2, 10)] + rng.normal(size=3) * 0.06, rng.uniform(0.01, 0.15, 3), wxyz))
+            boxes.append(
+                box_obstacle(
+                    path.translations[rng.integers(2, 10)] + rng.normal(size=3) * 0.06, rng.uniform(0.01, 0.15, 3), wxyz
+                )
+            )
         found = clearance(path, body, boxes, between=7)
         if found.least < 0 and found.waypoints[[0, -1]].min() > 0.01:
             return path, boxes

@@ -37,7 +37,12 @@ def pair_problem(model: tdf.Model, index: int):
     query = tdf.box_query(jax.random.key(index), QUERIES, QUERY_SIZE)
     reference = tdf.describe(model, tdf.Demonstration(case.points_a, path, query))
     field = tdf.encode(model, case.points_b)
-    return field, reference, {"goal": default_goal(field, reference), "energy": tdf.EnergyWeights()}, tdf.OptimizeConfig()
+    return (
+        field,
+        reference,
+        {"goal": default_goal(field, reference), "energy": tdf.EnergyWeights()},
+        tdf.OptimizeConfig(),
+    )
 
 
 def row_problem(model: tdf.Model, index: int):
@@ -47,7 +52,12 @@ def row_problem(model: tdf.Model, index: int):
     scene = settings.scene(setting)
     reference = settings.aim(setting, tdf.describe(model, scene.demonstration))
     field = tdf.encode(model, scene.points)
-    return field, reference, {"goal": settings.goal(setting, field, reference), "energy": setting.energy}, setting.optimiser
+    return (
+        field,
+        reference,
+        {"goal": settings.goal(setting, field, reference), "energy": setting.energy},
+        setting.optimiser,
+    )
 
 
 def compare(model: tdf.Model, problem, seed: int) -> dict:
@@ -68,21 +78,32 @@ def told(found: dict[str, dict]) -> str:
     """How the ratios of energies, solver over Adam, are distributed."""
     lines = []
     for kind in ("row", "pair"):
-        ratios = [one["solve"]["energy"] / one["adam"]["energy"] for name, one in found.items() if name.startswith(kind)]
+        ratios = [
+            one["solve"]["energy"] / one["adam"]["energy"] for name, one in found.items() if name.startswith(kind)
+        ]
         if ratios:
-            spread = ", ".join(f"{percent} %: {value:.4f}" for percent, value in zip(PERCENTILES, np.percentile(ratios, PERCENTILES)))
+            spread = ", ".join(
+                f"{percent} %: {value:.4f}" for percent, value in zip(PERCENTILES, np.percentile(ratios, PERCENTILES))
+            )
             lines.append(f"{len(ratios)} {kind}s, energy of solve over Adam's: mean {np.mean(ratios):.4f}; {spread}")
     return "\n".join(lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compare what is missing in the file, and tell; 2 for a user's mistake."""
-    parser = argparse.ArgumentParser(prog="python -m bench.energies", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog="python -m bench.energies", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--pairs", type=int, default=50, help="how many (default: 50)")
     parser.add_argument("--first", type=int, default=0, help="number of the first pair (default: 0)")
     parser.add_argument("--rows", type=int, default=len(PAPER), help="of table 1, at most 9 (default: 9)")
     parser.add_argument("--seed", type=int, default=0, help="of the starts (default: 0)")
-    parser.add_argument("--out", type=Path, default=Path("runs/energies.json"), help="file to keep and go on with (default: runs/energies.json)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("runs/energies.json"),
+        help="file to keep and go on with (default: runs/energies.json)",
+    )
     options = parser.parse_args(arguments)
     try:
         found = json.loads(options.out.read_text()) if options.out.exists() else {}
@@ -95,7 +116,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if name not in found:
                 found[name] = compare(model, make(model, index), options.seed)
                 replace_file("bench.energies", options.out, (json.dumps(found, indent=1) + "\n").encode())
-                print(name, {method: f"{one['energy']:.5f} in {one['seconds']:.1f} s" for method, one in found[name].items()}, file=sys.stderr)
+                print(
+                    name,
+                    {method: f"{one['energy']:.5f} in {one['seconds']:.1f} s" for method, one in found[name].items()},
+                    file=sys.stderr,
+                )
     except (InputError, OSError, json.JSONDecodeError) as error:
         print(f"bench.energies: error: {error}", file=sys.stderr)
         return 2

@@ -13,10 +13,15 @@ def failed_checks(record: dict) -> list[str]:
     named = [("parity", one) for one in record["parity"]]
     named += [(name, one) for name, row in record["rows"].items() for one in row["checks"]]
     failures = [
-        f"{name}: {one['what']} is {one['error']:.1e}; expected at most {one['tolerance']:.1e}" for name, one in named if not one["passed"]
+        f"{name}: {one['what']} is {one['error']:.1e}; expected at most {one['tolerance']:.1e}"
+        for name, one in named
+        if not one["passed"]
     ]
     for name, row in record["rows"].items():
-        failures += [f"{name}: {competitor} failed: {error.strip().splitlines()[-1]}" for competitor, error in row["errors"].items()]
+        failures += [
+            f"{name}: {competitor} failed: {error.strip().splitlines()[-1]}"
+            for competitor, error in row["errors"].items()
+        ]
     return failures
 
 
@@ -36,7 +41,9 @@ def lost_ratios(record: dict, baseline: dict) -> tuple[list[str], list[str]]:
             if found is None:
                 lost.append(f"{name}: no ratio {pair}; the baseline's is {expected:.2f}")
             elif found < LEAST * expected:
-                lost.append(f"{name}: {pair} is {found:.2f}, {found / expected:.2f} of the baseline's {expected:.2f}; expected {LEAST} of it")
+                lost.append(
+                    f"{name}: {pair} is {found:.2f}, {found / expected:.2f} of the baseline's {expected:.2f}; expected {LEAST} of it"
+                )
     return lost, apart
 
 
@@ -49,7 +56,9 @@ def read(path: str | Path) -> dict:
     try:
         record = json.loads(Path(path).read_text())
     except (OSError, ValueError) as error:
-        raise InputError(f"bench: cannot read the baseline {path} ({error}); expected a bench.json, such as --out writes") from None
+        raise InputError(
+            f"bench: cannot read the baseline {path} ({error}); expected a bench.json, such as --out writes"
+        ) from None
     if not isinstance(record, dict) or not isinstance(record.get("rows"), dict):
         raise InputError(f"bench: {path} has no rows; expected a bench.json, such as --out writes")
     return record

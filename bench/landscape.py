@@ -60,7 +60,8 @@ def plane(repetitions: int) -> dict:
     field, reference, start = case(PITCH)
     grid = tdf.plane_grid(HALF, COUNT, start)
     counts = {
-        share: lattice.evaluations(grid, lattice.layers(grid, np.asarray(reference.query), share)) for share in (True, False)
+        share: lattice.evaluations(grid, lattice.layers(grid, np.asarray(reference.query), share))
+        for share in (True, False)
     }
     times, values = {True: [], False: []}, {}
     first = {share: timed(field, reference, grid, share)[0] for share in (True, False)}
@@ -73,8 +74,16 @@ def plane(repetitions: int) -> dict:
         "points": list(grid.shape),
         "queries": len(reference.query),
         "waypoints": POSES,
-        "evaluations": {"shared": counts[True], "direct": counts[False], "one_by_one": int(np.prod(grid.shape)) * len(reference.query)},
-        "seconds": {"shared": times[True], "direct": times[False], "first": {"shared": first[True], "direct": first[False]}},
+        "evaluations": {
+            "shared": counts[True],
+            "direct": counts[False],
+            "one_by_one": int(np.prod(grid.shape)) * len(reference.query),
+        },
+        "seconds": {
+            "shared": times[True],
+            "direct": times[False],
+            "first": {"shared": first[True], "direct": first[False]},
+        },
         "evaluations_ratio": counts[False] / counts[True],
         "time_ratio": medians[False] / medians[True],
         "largest_relative_difference": float(np.abs(values[True] / values[False] - 1).max()),
@@ -116,7 +125,9 @@ def main() -> None:
     found = record["plane"]
     for name in ("shared", "direct"):
         spread = ", ".join(f"{seconds:.2f}" for seconds in found["seconds"][name])
-        print(f"plane, {name}: {found['evaluations'][name]:,} evaluations, {spread} s (first call {found['seconds']['first'][name]:.2f})")
+        print(
+            f"plane, {name}: {found['evaluations'][name]:,} evaluations, {spread} s (first call {found['seconds']['first'][name]:.2f})"
+        )
     print(
         f"plane: {found['evaluations_ratio']:.1f} x fewer evaluations, {found['time_ratio']:.1f} x less time, "
         f"energies differ by at most {found['largest_relative_difference']:.1e} of themselves"

@@ -127,7 +127,9 @@ def measure(row: Row, workers: Workers, state: dict, repetitions: int) -> dict:
     for name in row.plans:
         attempt(name, peak)
     competitors = {
-        name: _summary(row.plans[name], found, row.flops[name] if isinstance(row.flops, dict) else row.flops, name in OURS)
+        name: _summary(
+            row.plans[name], found, row.flops[name] if isinstance(row.flops, dict) else row.flops, name in OURS
+        )
         for name, found in runs.items()
         if name not in failed
     }

@@ -159,7 +159,9 @@ class OccupancyNetwork(nn.Module):
 
 def load(state: dict[str, np.ndarray], dtype: torch.dtype = torch.float32) -> OccupancyNetwork:
     """The network with a checkpoint's tensors, (out, in)."""
-    network = OccupancyNetwork(len(state["encoder.fc_c.map_to_feat.weight"]), len(state["decoder.fc_in.bias"])).to(dtype)
+    network = OccupancyNetwork(len(state["encoder.fc_c.map_to_feat.weight"]), len(state["decoder.fc_in.bias"])).to(
+        dtype
+    )
     network.load_state_dict({name: torch.tensor(tensor, dtype=dtype) for name, tensor in state.items()})
     return network.eval()
 

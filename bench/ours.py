@@ -61,7 +61,9 @@ def descent(model, settings, arrays):
     field, reference, energy = _problem(model, arrays)
     per_step = settings["per"] == "step"
     names = ("rotation_rate", "translation_rate", "final_rate")
-    config = functools.partial(tdf.OptimizeConfig, inits=len(arrays["starts"]), **{name: settings[name] for name in names})
+    config = functools.partial(
+        tdf.OptimizeConfig, inits=len(arrays["starts"]), **{name: settings[name] for name in names}
+    )
 
     def timed(iterations):
         began = time.perf_counter()
@@ -100,7 +102,13 @@ def solving(model, settings, arrays):
     def call():
         began = time.perf_counter()
         result = solve(
-            field, reference, jax.random.key(0), goal=goal, fix_last=settings["fix_last"], energy=energy, config=SolveConfig()
+            field,
+            reference,
+            jax.random.key(0),
+            goal=goal,
+            fix_last=settings["fix_last"],
+            energy=energy,
+            config=SolveConfig(),
         )
         jax.block_until_ready(result)
         return {"energies": result.energies, "seconds": time.perf_counter() - began}

@@ -31,7 +31,9 @@ def parity(workers: Workers, inits: int = 3, poses: int = 7, queries: int = 100)
 def original(workers: Workers) -> list[dict]:
     """The peer's latents, descriptors and occupancies against those of the published code."""
     if not GOLDEN.with_suffix(".npz").exists():
-        raise InputError(f"parity(): there are no golden outputs {GOLDEN}.npz; expected a checkout of the repository with its tests")
+        raise InputError(
+            f"parity(): there are no golden outputs {GOLDEN}.npz; expected a checkout of the repository with its tests"
+        )
     state = scene.weights(tdf.convert_checkpoint(GOLDEN.with_suffix(".pth")))
     with np.load(GOLDEN.with_suffix(".npz")) as stored:
         arrays = {name: stored[name] for name in ("point_cloud", "coords", "latent", "features", "occupancy")}
@@ -42,7 +44,9 @@ def original(workers: Workers) -> list[dict]:
         workers.ask("torch", "prepare", {"task": "golden", "settings": settings, "arrays": inputs, "state": state})
         found = workers.ask("torch", "run")["result"]
         names = ("latent", "features", "occupancy")
-        checks += [check(f"original, {name}, {precision}", difference(found[name], arrays[name]), tolerance) for name in names]
+        checks += [
+            check(f"original, {name}, {precision}", difference(found[name], arrays[name]), tolerance) for name in names
+        ]
     return checks
 
 
@@ -55,10 +59,17 @@ def energies(workers: Workers, inits: int, poses: int, queries: int) -> list[dic
         found[name] = workers.ask(name, "run")["result"]
     # The fixed last pose lies where eq. 3's norm has its kink: which way its derivative points there is a matter of
     # rounding.
-    found = {name: {kind: part if kind == "energies" else part[:, :-1] for kind, part in result.items()} for name, result in found.items()}
+    found = {
+        name: {kind: part if kind == "energies" else part[:, :-1] for kind, part in result.items()}
+        for name, result in found.items()
+    }
     expected = found.pop("torch")
     return [
-        check(f"{kind}, {name} and torch", difference(result[kind], expected[kind]), ENERGIES if kind == "energies" else GRADIENTS)
+        check(
+            f"{kind}, {name} and torch",
+            difference(result[kind], expected[kind]),
+            ENERGIES if kind == "energies" else GRADIENTS,
+        )
         for name, result in found.items()
         for kind in expected
     ]

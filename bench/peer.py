@@ -94,7 +94,9 @@ def descent(network, tuned, settings, arrays):
             with torch.no_grad():
                 fixed = descriptor_losses(network, problem, R0[:, free:], places[:, free:], first=free)
         for step in range(steps):
-            decay = settings["final_rate"] + (1 - settings["final_rate"]) * 0.5 * (1 + np.cos(np.pi * step / iterations))
+            decay = settings["final_rate"] + (1 - settings["final_rate"]) * 0.5 * (
+                1 + np.cos(np.pi * step / iterations)
+            )
             for group, rate in zip(adam.param_groups, rates):
                 group["lr"] = rate * decay
             loss = energies(turn, place, fixed)
@@ -103,7 +105,10 @@ def descent(network, tuned, settings, arrays):
             adam.step()
             losses.append(loss.detach())
         seconds = time.perf_counter() - began
-        result = {"losses": torch.stack(losses, dim=1), "seconds": seconds / steps if settings["per"] == "step" else seconds}
+        result = {
+            "losses": torch.stack(losses, dim=1),
+            "seconds": seconds / steps if settings["per"] == "step" else seconds,
+        }
         if steps == iterations and settings["per"] == "call":
             with torch.no_grad():
                 result["energies"] = energies(turn, place, fixed)

@@ -56,7 +56,10 @@ def report(rows: np.ndarray, right: np.ndarray, seen: np.ndarray, curve) -> dict
     """The area under the ROC and points of it, of the curve and of the residual alone."""
     predicted = np.array([tdf.recognition(*row, tuple(curve)) for row in rows])
     points = {
-        str(one): {"wrong_noticed": float(np.mean(predicted[right == 0] < one)), "right_doubted": float(np.mean(predicted[right == 1] < one))}
+        str(one): {
+            "wrong_noticed": float(np.mean(predicted[right == 0] < one)),
+            "right_doubted": float(np.mean(predicted[right == 1] < one)),
+        }
         for one in THRESHOLDS
     }
     areas = {"area": ranking(predicted, right), "area_of_the_residual_alone": ranking(-rows[:, 0], right)}
@@ -70,18 +73,24 @@ def main() -> None:
     parser.add_argument("--category", choices=list(FAMILIES), nargs="+", default=["mug"])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--count", type=int, default=100, help="right cases, and as many wrong ones, of each category")
-    parser.add_argument("--fit", action="store_true", help="fit the curve to these cases, instead of trying that of the weights")
+    parser.add_argument(
+        "--fit", action="store_true", help="fit the curve to these cases, instead of trying that of the weights"
+    )
     parser.add_argument("--out", type=Path, help="JSON file")
     settings = parser.parse_args()
     if settings.count < 1:
         parser.error(f"--count is {settings.count}; expected at least 1")
     model = tdf.load_model(settings.weights)
     if not settings.fit and model.info.name not in CURVES:
-        parser.error(f"--weights is {settings.weights}, which has no curve; expected one of {', '.join(CURVES)}, or --fit")
+        parser.error(
+            f"--weights is {settings.weights}, which has no curve; expected one of {', '.join(CURVES)}, or --fit"
+        )
     parts = [collected(model, category, settings.seed, settings.count) for category in settings.category]
     rows, right, seen = (np.concatenate(column) for column in zip(*parts))
     curve = logistic(features(rows), right) if settings.fit else CURVES[model.info.name]
-    found = {"weights": model.info.name, "seed": settings.seed, "curve": [float(x) for x in curve]} | report(rows, right, seen, curve)
+    found = {"weights": model.info.name, "seed": settings.seed, "curve": [float(x) for x in curve]} | report(
+        rows, right, seen, curve
+    )
     found["categories"] = {category: report(*part, curve) for category, part in zip(settings.category, parts)}
     print(json.dumps(found, indent=1))
     if settings.out is not None:

@@ -53,18 +53,35 @@ def _times(record):
             if found and found["note"]:
                 notes.append(f"- {row['title']}, {COMPETITORS[name].mark}: {found['note']}.")
         if others > BUSY and not record["quick"]:
-            notes.append(f"- {row['title']}: other processes used up to {others:.1f} cores meanwhile; measure again on an idle machine.")
+            notes.append(
+                f"- {row['title']}: other processes used up to {others:.1f} cores meanwhile; measure again on an idle machine."
+            )
         lines.append(_cells(row["title"], *cells, *(_ratio(row, pair) for pair in pairs)))
     return "## Times\n\n" + "\n".join(lines) + ("\n\n" + "\n".join(notes) if notes else "")
 
 
 def _rates(record):
     best = max(record["matmul_gflops"].values())
-    lines = [_cells("row", "competitor", "GFLOP/s", "of the matmul peak", "peak memory, MB", "before the row, MB", "compiling, s"), _rule(7)]
+    lines = [
+        _cells(
+            "row",
+            "competitor",
+            "GFLOP/s",
+            "of the matmul peak",
+            "peak memory, MB",
+            "before the row, MB",
+            "compiling, s",
+        ),
+        _rule(7),
+    ]
     for row in record["rows"].values():
         for name, found in row["competitors"].items():
             compiling = "" if found["compile_seconds"] is None else f"{found['compile_seconds']:.1f}"
-            rate = ("", "") if found["gflops"] is None else (f"{found['gflops']:.1f}", f"{100 * found['gflops'] / best:.0f} %")
+            rate = (
+                ("", "")
+                if found["gflops"] is None
+                else (f"{found['gflops']:.1f}", f"{100 * found['gflops'] / best:.0f} %")
+            )
             memory = f"{found['peak_megabytes']:.0f}", f"{found['base_megabytes']:.0f}"
             lines.append(_cells(row["title"], COMPETITORS[name].mark, *rate, *memory, compiling))
     words = (
@@ -80,10 +97,16 @@ def _targets(record):
         facts = row["facts"]
         if "target" not in facts:
             continue
-        reached = ", ".join(f"{COMPETITORS[name].title} {energy:.6f}" for name, energy in facts["energies"].items() if name != "torch_tuned")
+        reached = ", ".join(
+            f"{COMPETITORS[name].title} {energy:.6f}"
+            for name, energy in facts["energies"].items()
+            if name != "torch_tuned"
+        )
         below = facts.get("tdf_jax_steps")
         passed = "" if below is None else f"; (c)'s steps passed the target after {below}"
-        lines.append(f"- {row['title']}: target {facts['target']:.6f}, the best of PyTorch's starts; reached: {reached or 'nothing'}{passed}.")
+        lines.append(
+            f"- {row['title']}: target {facts['target']:.6f}, the best of PyTorch's starts; reached: {reached or 'nothing'}{passed}."
+        )
     return "## Targets\n\n" + "\n".join(lines) if lines else ""
 
 

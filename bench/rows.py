@@ -58,7 +58,9 @@ def select(found: list[Row], names: list[str] | None) -> list[Row]:
     """
     unknown = set(names or ()) - {row.name for row in found}
     if unknown:
-        raise InputError(f"bench: --only {', '.join(sorted(unknown))}; expected some of {', '.join(row.name for row in found)}")
+        raise InputError(
+            f"bench: --only {', '.join(sorted(unknown))}; expected some of {', '.join(row.name for row in found)}"
+        )
     return [row for row in found if not names or row.name in names]
 
 
@@ -71,7 +73,11 @@ def agree(tolerances: dict[str, float]):
         for name, result in others:
             for key, tolerance in tolerances.items():
                 common = tuple(slice(0, min(a, b)) for a, b in zip(np.shape(result[key]), np.shape(expected[key])))
-                found.append(check(f"{key}, {name} and {first}", difference(result[key][common], expected[key][common]), tolerance))
+                found.append(
+                    check(
+                        f"{key}, {name} and {first}", difference(result[key][common], expected[key][common]), tolerance
+                    )
+                )
         return found, {}
 
     return checks
@@ -82,7 +88,15 @@ def encoding(points: int) -> Row:
     plans = {name: Plan("encode") for name in (*PEERS, "tdf_jax")}
     sizes = {"points": points}
     title = f"encode {points} points"
-    return Row(f"encode_{points}", title, sizes, lambda: {"cloud": scene.cloud(points)}, plans, agree({"latent": LATENTS}), flops.encoder(points))
+    return Row(
+        f"encode_{points}",
+        title,
+        sizes,
+        lambda: {"cloud": scene.cloud(points)},
+        plans,
+        agree({"latent": LATENTS}),
+        flops.encoder(points),
+    )
 
 
 def fitting(name: str, inits: int, poses: int, queries: int) -> int:
@@ -101,7 +115,9 @@ def step(inits: int, poses: int, queries: int) -> Row:
     for name in PEERS:
         fit = fitting(name, inits, poses, queries)
         note = "" if fit == inits else f"{fit} starts, the most that fit into memory; time x {inits}/{fit}"
-        plans[name] = Plan("descent", settings(peer_steps), fit, once=name == "torch" and inits > 10, scale=inits / fit, note=note)
+        plans[name] = Plan(
+            "descent", settings(peer_steps), fit, once=name == "torch" and inits > 10, scale=inits / fit, note=note
+        )
     plans["tdf_jax"] = Plan("descent", settings(our_steps))
     title = f"one step, {inits} x {poses} x {queries}"
     sizes = {"inits": inits, "poses": poses, "queries": queries}
@@ -126,10 +142,17 @@ def target(sizes: Sizes, same_rates: bool = False) -> Row:
     probed = min(PROBED, iterations)
     plans = {
         "torch": Plan(
-            "descent", common | {"steps": probed}, scale=iterations / probed, note=f"{probed} steps measured, time x {iterations}/{probed}"
+            "descent",
+            common | {"steps": probed},
+            scale=iterations / probed,
+            note=f"{probed} steps measured, time x {iterations}/{probed}",
         ),
         "torch_tuned": Plan("descent", common | {"steps": iterations}, once=True),
-        "tdf_jax": Plan("descent", common | our_rates | {"iterations": iterations if same_rates else sizes.our_iterations}, once=same_rates),
+        "tdf_jax": Plan(
+            "descent",
+            common | our_rates | {"iterations": iterations if same_rates else sizes.our_iterations},
+            once=same_rates,
+        ),
     }
     if importlib.util.find_spec("tdf_jax.solvers.multistart"):
         plans["tdf_jax_solve"] = Plan("solving", {"fix_last": True}, once=same_rates)
@@ -137,7 +160,11 @@ def target(sizes: Sizes, same_rates: bool = False) -> Row:
         del plans["torch"]  # its steps take the same time at any rates
 
     def reached(results):
-        found, facts = ([], {}) if same_rates else agree({"losses": LOSSES})({name: results[name] for name in PEERS if name in results})
+        found, facts = (
+            ([], {})
+            if same_rates
+            else agree({"losses": LOSSES})({name: results[name] for name in PEERS if name in results})
+        )
         energies = {name: float(np.min(result["energies"])) for name, result in results.items() if "energies" in result}
         facts |= {"energies": energies}
         if "torch_tuned" not in energies:
@@ -191,4 +218,6 @@ def training(sizes: Sizes) -> Row:
     title = f"training step, {clouds} clouds x {points} points, {queries} queries"
     about = {"clouds": clouds, "points": points, "queries": queries}
     work = flops.training(clouds, points, queries)
-    return Row("train", title, about, lambda: scene.batch(clouds, points, queries), plans, agree({"losses": LOSSES}), work)
+    return Row(
+        "train", title, about, lambda: scene.batch(clouds, points, queries), plans, agree({"losses": LOSSES}), work
+    )

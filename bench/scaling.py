@@ -39,7 +39,10 @@ def scaling(workers: Workers, state: dict, quick: bool, repetitions: int, progre
                     del row.plans[name]
             found = measure(row, workers, state, repetitions)["competitors"]
             curves[axis].append({"value": value, "competitors": {name: _point(one) for name, one in found.items()}})
-            progress(f"{LABELS[axis]} {value}: " + ", ".join(f"{name} {one['seconds']['median']:.3g} s" for name, one in found.items()))
+            progress(
+                f"{LABELS[axis]} {value}: "
+                + ", ".join(f"{name} {one['seconds']['median']:.3g} s" for name, one in found.items())
+            )
     return curves
 
 
@@ -52,7 +55,11 @@ def figure(curves: dict) -> Figure:
         for row, (quantity, label) in enumerate((("seconds", "seconds"), ("megabytes", "memory above the start, MB"))):
             panel = axes[row, column]
             for index, name in enumerate(COMPETITORS):
-                known = [(point["value"], point["competitors"][name][quantity]) for point in points if name in point["competitors"]]
+                known = [
+                    (point["value"], point["competitors"][name][quantity])
+                    for point in points
+                    if name in point["competitors"]
+                ]
                 if known:
                     panel.loglog(*zip(*known), marker="o", color=f"C{index}", label=COMPETITORS[name].title)
             panel.set_xticks([point["value"] for point in points], [str(point["value"]) for point in points])
@@ -73,4 +80,7 @@ def save(path: Path, curves: dict) -> None:
 
 
 def _point(found):
-    return {"seconds": found["seconds"]["median"], "megabytes": max(1.0, found["peak_megabytes"] - found["base_megabytes"])}
+    return {
+        "seconds": found["seconds"]["median"],
+        "megabytes": max(1.0, found["peak_megabytes"] - found["base_megabytes"]),
+    }

@@ -65,12 +65,16 @@ def imitation(inits: int, poses: int, queries: int, seed: int = 0) -> dict[str, 
 def batch(clouds: int, points: int, queries: int) -> dict[str, np.ndarray]:
     """A training batch: clouds (clouds, points, 3), queries (clouds, queries, 3) and labels (clouds, queries)."""
     rng = np.random.default_rng(0)
-    centred = np.stack([tdf.thin(cloud(1500) @ Rotation.random(random_state=i).as_matrix().T, points) for i in range(clouds)])
+    centred = np.stack(
+        [tdf.thin(cloud(1500) @ Rotation.random(random_state=i).as_matrix().T, points) for i in range(clouds)]
+    )
     centred -= centred.mean(axis=1, keepdims=True)
     low, high = centred.min(axis=1, keepdims=True), centred.max(axis=1, keepdims=True)
     x = rng.uniform(low, high, (clouds, queries, 3))
     inside = np.stack([cKDTree(surface).query(some)[0] < NEAR for surface, some in zip(centred, x)])
-    return {name: np.asarray(array, np.float32) for name, array in (("clouds", centred), ("queries", x), ("inside", inside))}
+    return {
+        name: np.asarray(array, np.float32) for name, array in (("clouds", centred), ("queries", x), ("inside", inside))
+    }
 
 
 def plane(count: int, pitch: float, points: Float[np.ndarray, "points 3"]) -> tdf.Grid:

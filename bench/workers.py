@@ -70,7 +70,9 @@ class Worker:
             answer = pickle.load(self.process.stdout)
         except (EOFError, BrokenPipeError, pickle.UnpicklingError):
             code = self.process.wait()
-            raise WorkerError(f"the process of {self.name} ended with {code}" + (", probably out of memory" if code == -9 else "")) from None
+            raise WorkerError(
+                f"the process of {self.name} ended with {code}" + (", probably out of memory" if code == -9 else "")
+            ) from None
         if "error" in answer:
             raise WorkerError(answer["error"])
         return answer

@@ -188,6 +188,8 @@ def __getattr__(name: str):
 
         from tdf_jax.geometry import se3
 
-        warnings.warn("tdf_jax.poses is deprecated; use tdf_jax.turns and tdf_jax.rotation_grid", DeprecationWarning, stacklevel=2)
+        warnings.warn(
+            "tdf_jax.poses is deprecated; use tdf_jax.turns and tdf_jax.rotation_grid", DeprecationWarning, stacklevel=2
+        )
         return se3
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

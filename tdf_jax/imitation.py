@@ -75,7 +75,9 @@ def imitate(
     if not isinstance(config, CarryConfig | SolveConfig | OptimizeConfig):
         raise InputError(f"imitate(): config is {config!r}; expected a CarryConfig, SolveConfig or OptimizeConfig")
     if isinstance(config, CarryConfig) and energy is not None:
-        raise InputError("imitate(): energy is given, but carrying minimises no eq. 3; expected config=SolveConfig() or OptimizeConfig() with it, or no energy")
+        raise InputError(
+            "imitate(): energy is given, but carrying minimises no eq. 3; expected config=SolveConfig() or OptimizeConfig() with it, or no energy"
+        )
     reference = demonstration if isinstance(demonstration, Reference) else describe(model, demonstration)
     field = encode(model, points)
     goal = None if goal is None else _finite("goal", goal, (7,))
@@ -87,12 +89,16 @@ def imitate(
         result = carry(field, reference, key, config=config, **settings)
         return _judged(result, model.info.name, field, points)
     minimise = optimize if isinstance(config, OptimizeConfig) else solve
-    return minimise(field, reference, key, energy=EnergyWeights() if energy is None else energy, config=config, **settings)
+    return minimise(
+        field, reference, key, energy=EnergyWeights() if energy is None else energy, config=config, **settings
+    )
 
 
 def _judged(result: Result, weights: str, field, points) -> Result:
     """The result with what shipped weights are calibrated for: how likely the pick is right, and the object one of their category."""
-    recognised = recognition(result.residual, surface_logit(field, points), CURVES[weights]) if weights in CURVES else None
+    recognised = (
+        recognition(result.residual, surface_logit(field, points), CURVES[weights]) if weights in CURVES else None
+    )
     if recognised is not None and recognised < DOUBT:
         warnings.warn(
             f"imitate(): the object does not look like one of the demonstration's category to the weights {weights!r} (probability {recognised:.2g}); check the target, its unit and "
@@ -100,7 +106,9 @@ def _judged(result: Result, weights: str, field, points) -> Result:
             CategoryWarning,
             stacklevel=3,
         )
-    return dataclasses.replace(result, recognised=recognised, confidence=confidence(result.residual) if weights in CALIBRATED else None)
+    return dataclasses.replace(
+        result, recognised=recognised, confidence=confidence(result.residual) if weights in CALIBRATED else None
+    )
 
 
 def imitate_batch(

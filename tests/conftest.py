@@ -97,7 +97,7 @@ def golden(request):
 
 @pytest.fixture(scope="session", params=TOLERANCE)
 def precision(request):
-    """"float32" or "float64": values are made under `enabled(precision)` and are of that type."""
+    """ "float32" or "float64": values are made under `enabled(precision)` and are of that type."""
     return request.param
 
 

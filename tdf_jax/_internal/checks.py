@@ -10,7 +10,9 @@ from tdf_jax._internal.errors import InputError
 def check_key(function: str, key) -> None:
     """Raise InputError unless it is one random key, of `jax.random.key` or the older `jax.random.PRNGKey`."""
     shape, dtype = getattr(key, "shape", None), getattr(key, "dtype", np.dtype(object))
-    if not (shape == () and jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key)) and not (shape == (2,) and dtype == np.uint32):
+    if not (shape == () and jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key)) and not (
+        shape == (2,) and dtype == np.uint32
+    ):
         got = repr(key) if shape is None or shape == () else f"an array of shape {shape}"
         raise InputError(f"{function}: key is {got}; expected one random key, such as jax.random.key(0)")
 
@@ -91,6 +93,8 @@ def check_query(function: str, query) -> None:
     """Raise InputError unless query points are (queries, 3), at least one, and finite."""
     shape = np.shape(query)
     if len(shape) != 2 or shape[1] != 3 or shape[0] < 1:
-        raise InputError(f"{function}: query points have shape {shape}; expected (queries, 3). Try tdf.box_query(key, count=500)")
+        raise InputError(
+            f"{function}: query points have shape {shape}; expected (queries, 3). Try tdf.box_query(key, count=500)"
+        )
     if not isinstance(query, jax.core.Tracer) and not np.isfinite(np.asarray(query)).all():
         raise InputError(f"{function}: some query points are NaN or infinite; expected finite metres")

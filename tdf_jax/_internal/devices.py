@@ -29,7 +29,9 @@ def points_at_a_time(cpu_points: int) -> int:
 def check_mesh(function: str, mesh) -> None:
     """Raise InputError unless it is a mesh, or None."""
     if mesh is not None and not isinstance(mesh, Mesh):
-        raise InputError(f"{function}: mesh is {mesh!r}; expected a jax.sharding.Mesh, such as jax.make_mesh((2,), ('devices',))")
+        raise InputError(
+            f"{function}: mesh is {mesh!r}; expected a jax.sharding.Mesh, such as jax.make_mesh((2,), ('devices',))"
+        )
 
 
 def alone() -> Mesh:

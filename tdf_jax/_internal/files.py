@@ -44,7 +44,13 @@ def replace_file(function: str, path: str | os.PathLike, content: bytes | Callab
             temporary.unlink()
 
 
-def kept(function: str, folder: Path, about: Any, compute: Callable[[], Mapping[str, ArrayLike]], build: Callable[[dict[str, np.ndarray]], Any] = dict) -> Any:
+def kept(
+    function: str,
+    folder: Path,
+    about: Any,
+    compute: Callable[[], Mapping[str, ArrayLike]],
+    build: Callable[[dict[str, np.ndarray]], Any] = dict,
+) -> Any:
     """What is made of arrays from a folder of such, or computed and put there.
 
     Args:

@@ -10,7 +10,9 @@ import tyro
 
 _NONE = "(default: none)"
 PAGE, RECORD, RUNS = "benchmark.md", "benchmark.json", "runs"
-Cloud = Literal["full", "views1", "views2", "views4", "points300", "points1000", "points3000", "noise", "half", "double"]
+Cloud = Literal[
+    "full", "views1", "views2", "views4", "points300", "points1000", "points3000", "noise", "half", "double"
+]
 
 
 def benchmark(
@@ -62,13 +64,22 @@ def benchmark(
     targets = [] if meshes is None else load_annotated(meshes)
     for target in targets:
         if target.category != "mug":
-            raise InputError(f"tdf benchmark: --meshes has {target.name}, a {target.category}; expected mugs; tdf evaluate measures others")
+            raise InputError(
+                f"tdf benchmark: --meshes has {target.name}, a {target.category}; expected mugs; tdf evaluate measures others"
+            )
     model = load_model(weights)
     folder = _folder(out)
-    makers = [make for condition in dict.fromkeys(clouds) for make in _makers(pairs, seed, height, condition, targets, poses)]
-    scores = [score(method, attempt, task) for task, method, attempt in run(makers, model, names, folder, seed=seed, inits=inits)]
+    makers = [
+        make for condition in dict.fromkeys(clouds) for make in _makers(pairs, seed, height, condition, targets, poses)
+    ]
+    scores = [
+        score(method, attempt, task)
+        for task, method, attempt in run(makers, model, names, folder, seed=seed, inits=inits)
+    ]
     if not scores:
-        raise InputError("tdf benchmark: none of --methods can be tried on these objects; the oracle needs generated mugs, and variants some of every fifth task")
+        raise InputError(
+            "tdf benchmark: none of --methods can be tried on these objects; the oracle needs generated mugs, and variants some of every fifth task"
+        )
     settings = {
         "weights": weights, "pairs": pairs, "seed": seed, "height": height, "clouds": clouds, "methods": methods, "inits": inits,
         "meshes": None if meshes is None else str(meshes), "poses": poses, "demonstrations": demonstrations,
@@ -76,7 +87,11 @@ def benchmark(
     picks = learnt(makers, model, demonstrations, folder, seed=seed)
     extras = sections(scores, picks)
     _draw(out, makers, scores, extras)
-    replace_file("tdf benchmark", out / RECORD, (json.dumps(record(scores, model, settings, extras), allow_nan=False) + "\n").encode())
+    replace_file(
+        "tdf benchmark",
+        out / RECORD,
+        (json.dumps(record(scores, model, settings, extras), allow_nan=False) + "\n").encode(),
+    )
     replace_file("tdf benchmark", out / PAGE, page(scores, model, settings, extras).encode())
     print(out / PAGE)
 
@@ -89,7 +104,9 @@ def _makers(pairs, seed, height, clouds, targets, poses) -> list[Callable]:
         return make_task(mug_case(seed, index, height=height, clouds=clouds), seed, index)
 
     def real(number, pose):
-        return make_task(mesh_case(seed, pose, targets[number], clouds=clouds), seed, mesh_index(targets[number].name, pose))
+        return make_task(
+            mesh_case(seed, pose, targets[number], clouds=clouds), seed, mesh_index(targets[number].name, pose)
+        )
 
     meshes = [functools.partial(real, number, pose) for number in range(len(targets)) for pose in range(poses)]
     return [functools.partial(generated, index) for index in range(pairs)] + meshes
@@ -104,7 +121,10 @@ def _draw(out, makers, scores, extras) -> None:
 
     # The first six tasks are one of each path, not displaced; later ones show where goals go.
     kinds = len(PATHS)
-    shown = [makers[index + index % 4 * kinds if index + index % 4 * kinds < len(makers) else index] for index in range(min(kinds, len(makers)))]
+    shown = [
+        makers[index + index % 4 * kinds if index + index % 4 * kinds < len(makers) else index]
+        for index in range(min(kinds, len(makers)))
+    ]
     save_figure(out / PICTURES["truth"], truth_figure([make() for make in shown]))
     first = scores[0].clouds
     save_figure(out / PICTURES["errors"], errors_figure([one for one in scores if one.clouds == first], LIBRARY))
@@ -119,7 +139,9 @@ def _folder(out: Path) -> Path:
     from tdf_jax._internal.errors import InputError
 
     if (out / PAGE).exists() and not (out / RECORD).exists():
-        raise InputError(f"tdf benchmark: {out / PAGE} is not of an earlier benchmark, there is no {RECORD} beside it; expected another --out: nothing of yours is overwritten")
+        raise InputError(
+            f"tdf benchmark: {out / PAGE} is not of an earlier benchmark, there is no {RECORD} beside it; expected another --out: nothing of yours is overwritten"
+        )
     try:
         (out / RUNS).mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -136,12 +158,21 @@ def _check(pairs, seed, height, clouds, methods, inits, meshes, poses, demonstra
         if not truth:
             raise InputError(f"tdf benchmark: {what}")
 
-    need(pairs >= 1 or (meshes is not None and pairs == 0), f"--pairs is {pairs}; expected at least 1, or 0 with --meshes")
+    need(
+        pairs >= 1 or (meshes is not None and pairs == 0),
+        f"--pairs is {pairs}; expected at least 1, or 0 with --meshes",
+    )
     need(0 <= seed < 2**32, f"--seed is {seed}; expected 0 to {2**32 - 1}")
     need(0.01 <= height <= 1.0, f"--height is {height}; expected metres between 0.01 and 1")
     need(inits >= 1, f"--inits is {inits}; expected at least 1")
     need(poses >= 1, f"--poses is {poses}; expected at least 1")
     need(clouds, "--clouds is empty; expected at least one condition, such as full")
     unknown = [name for name in methods if name not in (*METHODS, "all")]
-    need(methods and not unknown, f"--methods has {', '.join(map(repr, unknown)) or 'none'}; expected all, or some of {', '.join(map(repr, METHODS))}")
-    need(all(1 <= count <= MOST for count in demonstrations), f"--demonstrations is {demonstrations}; expected numbers of 1 to {MOST}")
+    need(
+        methods and not unknown,
+        f"--methods has {', '.join(map(repr, unknown)) or 'none'}; expected all, or some of {', '.join(map(repr, METHODS))}",
+    )
+    need(
+        all(1 <= count <= MOST for count in demonstrations),
+        f"--demonstrations is {demonstrations}; expected numbers of 1 to {MOST}",
+    )

@@ -29,6 +29,8 @@ def dataset(
     for name, data in zip(("training", "validation"), parts):
         box, near = data.inside[:, data.uniform].mean(), data.inside[:, data.uniform.stop :].mean()
         seen = data.visible.mean()
-        print(f"{name}: {len(data.surface)} objects; inside: {box:.1%} of the uniform queries, {near:.1%} of those near the surface; "
-              f"a camera sees {seen:.0%} of a surface")
+        print(
+            f"{name}: {len(data.surface)} objects; inside: {box:.1%} of the uniform queries, {near:.1%} of those near the surface; "
+            f"a camera sees {seen:.0%} of a surface"
+        )
     print(f"saved {out}")

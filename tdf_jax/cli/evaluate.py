@@ -17,12 +17,16 @@ NAMES = ("reconstructions.png", "transfers.png")
 MOST_GENERATED = 6
 _NONE = "(default: none)"
 Category = Literal["mug", "bowl", "bottle"]
-Cloud = Literal["full", "views1", "views2", "views4", "points300", "points1000", "points3000", "noise", "half", "double", "all"]
+Cloud = Literal[
+    "full", "views1", "views2", "views4", "points300", "points1000", "points3000", "noise", "half", "double", "all"
+]
 
 
 def evaluate(
     weights: str = "mug",
-    category: Annotated[tuple[Category, ...], tyro.conf.arg(help_behavior_hint="(default: that of shipped weights; mug)")] = (),
+    category: Annotated[
+        tuple[Category, ...], tyro.conf.arg(help_behavior_hint="(default: that of shipped weights; mug)")
+    ] = (),
     pairs: int = 50,
     seed: int = 0,
     size: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: 0.12, 0.20, 0.22)")] = None,
@@ -86,18 +90,26 @@ def evaluate(
     model = load_model(weights)
     unasked = sorted({target.category for target in targets} - set(categories))
     if unasked:
-        raise InputError(f"tdf evaluate: --meshes has a {unasked[0]}; expected {', '.join(categories)} only; add it to --category, or move it away")
+        raise InputError(
+            f"tdf evaluate: --meshes has a {unasked[0]}; expected {', '.join(categories)} only; add it to --category, or move it away"
+        )
     makers = {}
     for name in categories:
-        makers[scores.label(name)] = [functools.partial(generated_case, name, seed, index, size=size) for index in range(pairs)]
+        makers[scores.label(name)] = [
+            functools.partial(generated_case, name, seed, index, size=size) for index in range(pairs)
+        ]
         real = [target for target in targets if target.category == name]
-        makers[scores.label(name, real=True)] = [functools.partial(mesh_case, seed, pose, target) for target in real for pose in range(poses)]
+        makers[scores.label(name, real=True)] = [
+            functools.partial(mesh_case, seed, pose, target) for target in real for pose in range(poses)
+        ]
     outcomes = {}
     for objects, several in makers.items():
         for condition in (CONDITIONS if "all" in clouds else dict.fromkeys(clouds)) if several else ():
             print(f"{objects}, cloud {condition}", file=sys.stderr)
             cases = [make(place=place, clouds=condition) for make in several]
-            outcomes[objects, condition] = compare(cases, model, BASELINES if baselines else (), seed=seed, config=config)
+            outcomes[objects, condition] = compare(
+                cases, model, BASELINES if baselines else (), seed=seed, config=config
+            )
             if json is not None:  # as far as it goes: all of it can take hours
                 scores.write(json, scores.record(outcomes, settings, model))
     print(scores.table(outcomes, settings))
@@ -127,7 +139,9 @@ def _check_place(place: str | None, categories: tuple[str, ...]) -> None:
 
     for category in categories:
         if place is not None and place not in FAMILIES[category].places:
-            raise InputError(f"tdf evaluate: --place is {place!r}; expected one of a {category}'s: {', '.join(FAMILIES[category].places)}")
+            raise InputError(
+                f"tdf evaluate: --place is {place!r}; expected one of a {category}'s: {', '.join(FAMILIES[category].places)}"
+            )
 
 
 def _check_outputs(json: Path | None, card: Path | None, figures: Path | None) -> None:
@@ -160,11 +174,15 @@ def _draw(folder: Path, model: "Model", outcomes: "Outcomes") -> None:
         if clouds == condition:
             names = [case.instance for case in outcome.cases]
             firsts = [names.index(name) for name in dict.fromkeys(names)]
-            panels += [_panel(model, outcome, index) for index in firsts[: None if is_real(objects) else MOST_GENERATED]]
+            panels += [
+                _panel(model, outcome, index) for index in firsts[: None if is_real(objects) else MOST_GENERATED]
+            ]
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
-        raise InputError(f"tdf evaluate: cannot make {folder} ({error}); expected a place in an existing folder") from None
+        raise InputError(
+            f"tdf evaluate: cannot make {folder} ({error}); expected a place in an existing folder"
+        ) from None
     words = f"weights {model.info.name}, cloud {condition}"
     figures = (
         reconstruction_figure(panels, f"Surfaces of occupancy 0.5, refined: {words}"),
@@ -193,7 +211,9 @@ def _panel(model: "Model", outcome: "Outcome", index: int) -> "Panel":
         overlap="IoU n/a: not closed" if iou is None else f"IoU {iou:.2f}",
         error=f"{100 * outcome.distance[index]:.1f} cm, {outcome.angle[index]:.0f}° off",
         triangles=np.asarray(case.object_b.mesh.triangles),
-        found=reconstructed(refine(model, encode(model, case.points_b), case.points_b), T_world_b, case.object_b.mesh.bounds),
+        found=reconstructed(
+            refine(model, encode(model, case.points_b), case.points_b), T_world_b, case.object_b.mesh.bounds
+        ),
         T_object_true=np.linalg.inv(T_world_b) @ case.T_world_place_b,
         T_object_found=np.linalg.inv(T_world_b) @ T_world_found,
         size=QUERY_SIZE * case.scale,

@@ -217,7 +217,10 @@ def _table(record: dict, out: Path) -> str:
     elif "scouts" in sizes:
         starts, best = "{inits} starts, {scouts} of the keyframe", "the best candidate of every waypoint"
     else:
-        starts, best = "{inits} starts, {iterations} iterations", f"start {record['best'] + 1} of {sizes['inits']}; {record['status']}"
+        starts, best = (
+            "{inits} starts, {iterations} iterations",
+            f"start {record['best'] + 1} of {sizes['inits']}; {record['status']}",
+        )
     parts = ", ".join(f"{name} {value:.1f}" for name, value in seconds.items() if name != "total")
     pick = path = "n/a (the truth is not known)"
     if found is not None:

@@ -109,7 +109,9 @@ def _grid(settings, waypoints, axes) -> Grid:
 
 def _check_size(settings, waypoints, count) -> None:
     """Refuse what would not fit on the disk, before any work."""
-    sides = np.full(3, 2 * settings.half) if settings.grid != "path" else np.ptp(waypoints, axis=0) + 2 * settings.radius
+    sides = (
+        np.full(3, 2 * settings.half) if settings.grid != "path" else np.ptp(waypoints, axis=0) + 2 * settings.radius
+    )
     points = math.prod(float(side) / settings.pitch + 1 for side in sides[: 2 if settings.grid in PLANES else 3])
     needed = points * NUMBER * 2 * count * 2  # energies and rotations, unfinished and finished
     parent = settings.out.resolve().parent
@@ -163,7 +165,10 @@ def _swept(settings, field: DescriptorField, reference: Reference, grid: Grid, r
             )
         found, done = dataclasses.replace(kept, reduce=settings.reduce), about["done"]
     saved = time.monotonic()
-    with contextlib.closing(fill(found, field, reference, done)) as parts, tqdm(desc="sweeping", unit="tile", initial=done) as bar:
+    with (
+        contextlib.closing(fill(found, field, reference, done)) as parts,
+        tqdm(desc="sweeping", unit="tile", initial=done) as bar,
+    ):
         try:
             for done, total in parts:
                 bar.total = total
@@ -219,7 +224,10 @@ def _record(settings, found: Landscape, reference, change, waypoints, expected, 
     points = math.prod(found.grid.shape) if found.grid.mask is None else int(found.grid.mask.sum())
     return {
         "schema": SCHEMA,
-        "settings": {name: str(value) if isinstance(value, Path) else value for name, value in dataclasses.asdict(settings).items()},
+        "settings": {
+            name: str(value) if isinstance(value, Path) else value
+            for name, value in dataclasses.asdict(settings).items()
+        },
         "grid": {"shape": found.grid.shape, "steps": found.grid.steps.tolist(), "first": found.grid.first.tolist()},
         "queries": len(query),
         "rotations": len(found.rotations),
@@ -241,12 +249,17 @@ def _table(record: dict, out: Path) -> str:
     against = "the true waypoints" if record["truth"] is not None else "the demonstration's, moved with the centroid"
     change, route = record["query_change"], record["path_metres"]
     rows = {
-        "grid": " x ".join(map(str, record["grid"]["shape"])) + f" points, {record['queries']} queries, {record['rotations']} orientations",
+        "grid": " x ".join(map(str, record["grid"]["shape"]))
+        + f" points, {record['queries']} queries, {record['rotations']} orientations",
         "evaluations": f"{record['evaluations']:,} of the field; one by one {record['one_by_one']:,}",
-        "lattice": "none" if change is None else f"changes the energy by {change['median']:.1%} (median), {change['largest']:.1%} (most)",
+        "lattice": "none"
+        if change is None
+        else f"changes the energy by {change['median']:.1%} (median), {change['largest']:.1%} (most)",
         "energy": f"least {record['energy']['least']:.5f}, median {record['energy']['median']:.5f}",
         "minimisers": ", ".join(f"{100 * metres:.1f}" for metres in record["minimiser_metres"]) + f" cm from {against}",
-        "lowest-cost path": "not sought, the grid is too large" if route is None else f"{100 * route:.1f} cm from the polyline through them, mean",
+        "lowest-cost path": "not sought, the grid is too large"
+        if route is None
+        else f"{100 * route:.1f} cm from the polyline through them, mean",
         "time": f"{record['seconds']['total']:.1f} s, sweep {record['seconds']['sweep']:.1f}",
         "written to": str(out),
     }

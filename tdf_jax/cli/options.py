@@ -50,10 +50,15 @@ class SceneSettings:
 
     target: Annotated[Path | None, _option("FILE", "a generated object")] = None
     scale: float = 1.0
-    target_pose: Annotated[Literal["given", "random"] | None, _option(default="given for a file, random for a generated object")] = None
+    target_pose: Annotated[
+        Literal["given", "random"] | None, _option(default="given for a file, random for a generated object")
+    ] = None
     demonstration: Annotated[Path | None, _option("FILE", "one on another generated object")] = None
     category: Annotated[Literal["mug", "bowl", "bottle"] | None, _option(default="that of shipped weights; mug")] = None
-    trajectory: Annotated[Literal["line", "semicircle", "wave", "lift_over", "tilt_and_pour", "hang_on_rack"] | None, _option(default="wave of a mug, lift_over of others")] = None
+    trajectory: Annotated[
+        Literal["line", "semicircle", "wave", "lift_over", "tilt_and_pour", "hang_on_rack"] | None,
+        _option(default="wave of a mug, lift_over of others"),
+    ] = None
     poses: Annotated[int | None, _option("INT", "7, or those of the demonstration file")] = None
     queries: Annotated[int | None, _option("INT", "128")] = None
     points: int = 1500
@@ -122,7 +127,9 @@ class LandscapeSettings(SceneSettings):
     half: float = 0.3
     radius: float = 0.1
     pitch: float = 0.012
-    query: Annotated[Literal["lattice", "snapped", "given"] | None, _option(default="lattice; given for many orientations")] = None
+    query: Annotated[
+        Literal["lattice", "snapped", "given"] | None, _option(default="lattice; given for many orientations")
+    ] = None
     rotation: Literal["pick", "identity", "best", "turns"] = "pick"
     rotations: int = 24
     axis: Annotated[tuple[float, float, float], _option("X Y Z")] = (0.0, 0.0, 1.0)
@@ -168,7 +175,9 @@ def resolved(settings: SceneSettings) -> SceneSettings:
         )
     for name in ("trajectory", "queries"):
         if getattr(settings, name) is not None:
-            raise InputError(f"{settings.COMMAND}: --{name} is for a generated demonstration, and there is a file; drop one")
+            raise InputError(
+                f"{settings.COMMAND}: --{name} is for a generated demonstration, and there is a file; drop one"
+            )
     return dataclasses.replace(settings, target_pose=pose)
 
 
@@ -179,23 +188,33 @@ def _check_numbers(settings: SceneSettings) -> None:
         raise InputError(f"{settings.COMMAND}: --scale is for a --target file; give one, or drop --scale")
     if isinstance(settings, Settings):
         if settings.k is not None and settings.method == "carry":
-            raise InputError("tdf imitate: --k is a weight of eq. 3, which --method carry does not minimise; drop it, or add --method gauss-newton or adam")
+            raise InputError(
+                "tdf imitate: --k is a weight of eq. 3, which --method carry does not minimise; drop it, or add --method gauss-newton or adam"
+            )
         if settings.inits is not None and settings.inits < 1:
             raise InputError(f"tdf imitate: --inits is {settings.inits}; expected at least 1")
         if settings.k is not None and not 0 <= settings.k < np.inf:
             raise InputError(f"tdf imitate: --k is {settings.k}; expected a weight of 0 or more")
         if not np.isfinite(settings.goal_offset).all():
-            raise InputError(f"tdf imitate: --goal-offset is {settings.goal_offset}; expected three finite numbers, metres")
+            raise InputError(
+                f"tdf imitate: --goal-offset is {settings.goal_offset}; expected three finite numbers, metres"
+            )
     if isinstance(settings, LandscapeSettings):
         for name in ("half", "radius", "pitch"):
             if not 0 < getattr(settings, name) < np.inf:
-                raise InputError(f"tdf landscape: --{name} is {getattr(settings, name)}; expected a length above 0, metres")
+                raise InputError(
+                    f"tdf landscape: --{name} is {getattr(settings, name)}; expected a length above 0, metres"
+                )
         if settings.grid != "path" and settings.half < settings.pitch / 2:
-            raise InputError(f"tdf landscape: --half is {settings.half}; expected at least half the pitch of {settings.pitch}: two points a side")
+            raise InputError(
+                f"tdf landscape: --half is {settings.half}; expected at least half the pitch of {settings.pitch}: two points a side"
+            )
         if not 0 <= settings.sharpness <= SHARPEST:
             raise InputError(f"tdf landscape: --sharpness is {settings.sharpness}; expected 0 to {SHARPEST:g}")
         if settings.grid == "path" and settings.pitch > settings.radius:
-            raise InputError(f"tdf landscape: --pitch is {settings.pitch} and --radius {settings.radius}; expected a pitch of at most the radius")
+            raise InputError(
+                f"tdf landscape: --pitch is {settings.pitch} and --radius {settings.radius}; expected a pitch of at most the radius"
+            )
         if settings.rotations < 1:
             raise InputError(f"tdf landscape: --rotations is {settings.rotations}; expected at least 1")
 

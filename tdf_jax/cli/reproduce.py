@@ -88,7 +88,9 @@ def _fig2(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
     from tdf_jax.viz import paper as pictures
 
     count = FAST_GRID if fast else GRID
-    fields = {name: store.landscapes(base, name, count) for name in tqdm(landscapes.FIELDS, desc="figure 2", unit="field")}
+    fields = {
+        name: store.landscapes(base, name, count) for name in tqdm(landscapes.FIELDS, desc="figure 2", unit="field")
+    }
     yield _picture(out / "fig2.png", pictures.figure2({"test mug": fields["test mug"]}))
     yield _picture(out / "fig2_mugs_and_poses.png", pictures.figure2(fields))
 
@@ -105,7 +107,9 @@ def _fig4(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
 
     settings = figures.figure4(base)
     runs = _run_all(store, settings, "figure 4")
-    yield _picture(out / "fig4.png", pictures.figure4(runs, {name: scene(setting) for name, setting in settings.items()}))
+    yield _picture(
+        out / "fig4.png", pictures.figure4(runs, {name: scene(setting) for name, setting in settings.items()})
+    )
     yield _picture(out / "fig4_turn.png", pictures.figure4_turn(runs))
 
 

@@ -40,6 +40,8 @@ def shapes(
     family = FAMILIES[category]
     real = [] if meshes is None else [one for one in load_annotated(meshes) if one.category == category]
     generated = [family.build(family.sample(np.random.default_rng([seed, index]))) for index in range(count)]
-    named = [(FOLDS[one.fold], one.mesh) for one in generated] + [(f"{one.name}\n{FOLDS[one.fold]}", one.mesh) for one in real]
+    named = [(FOLDS[one.fold], one.mesh) for one in generated] + [
+        (f"{one.name}\n{FOLDS[one.fold]}", one.mesh) for one in real
+    ]
     save_figure(out, contact_sheet(named))
     print(f"saved {out}")

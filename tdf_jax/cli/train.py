@@ -20,7 +20,8 @@ from tdf_jax.training.run_folder import metrics, settings_of
 def train(
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")],
     data: Annotated[
-        tuple[Path, ...], tyro.conf.arg(metavar="DIR [DIR ...]", help_behavior_hint="(default: generated mugs, in OUT/data)")
+        tuple[Path, ...],
+        tyro.conf.arg(metavar="DIR [DIR ...]", help_behavior_hint="(default: generated mugs, in OUT/data)"),
     ] = (),
     start_from: Annotated[
         str | None, tyro.conf.arg(metavar="WEIGHTS", help_behavior_hint="(default: random weights)")
@@ -52,7 +53,9 @@ def train(
     if minutes is not None and not 0 < minutes < float("inf"):
         raise InputError(f"tdf train: --minutes is {minutes}; expected a positive number")
     if workers < 0:
-        raise InputError(f"tdf train: --workers is {workers}; expected 1 or more, or 0 for as many as suit this machine")
+        raise InputError(
+            f"tdf train: --workers is {workers}; expected 1 or more, or 0 for as many as suit this machine"
+        )
     workers = workers or usual_workers()
     target = _target(out, weights)
     model = None if start_from is None else load_model(start_from)
@@ -60,7 +63,9 @@ def train(
         # Asymmetry is no size: a network may go on with another, and keeps its own where none is asked for.
         network = dataclasses.replace(model.config, asymmetry=config.network.asymmetry)
         if network != config.network:
-            raise InputError(f"tdf train: --start-from {start_from} is a network of other sizes ({model.config}); expected {config.network}")
+            raise InputError(
+                f"tdf train: --start-from {start_from} is a network of other sizes ({model.config}); expected {config.network}"
+            )
         config = dataclasses.replace(config, network=network if network.asymmetry else model.config)
     if not data:
         data = (out / "data",)

@@ -23,7 +23,9 @@ COMPENSATOR_ORDERS = ("frobenius", "infinity")
 
 
 @functools.partial(
-    jax.tree_util.register_dataclass, data_fields=["correlation", "compensator", "lever"], meta_fields=["pose_norm", "compensator_order"]
+    jax.tree_util.register_dataclass,
+    data_fields=["correlation", "compensator", "lever"],
+    meta_fields=["pose_norm", "compensator_order"],
 )
 @dataclasses.dataclass(frozen=True)
 class EnergyWeights:
@@ -53,7 +55,9 @@ class EnergyWeights:
     def __post_init__(self):
         for name, known in (("pose_norm", POSE_NORMS), ("compensator_order", COMPENSATOR_ORDERS)):
             if getattr(self, name) not in known:
-                raise InputError(f"EnergyWeights(): {name} is {getattr(self, name)!r}; expected one of {', '.join(known)}")
+                raise InputError(
+                    f"EnergyWeights(): {name} is {getattr(self, name)!r}; expected one of {', '.join(known)}"
+                )
         for name in ("correlation", "compensator", "lever"):
             value = getattr(self, name)
             if isinstance(value, int | float | np.number) and not 0 <= value < np.inf:
@@ -105,7 +109,11 @@ def waypoint_loss(
 
 
 def pose_energy(
-    R: Float[Array, "poses 3 3"], t: Float[Array, "poses 3"], origin: Float[Array, "3"], reference: Reference, weights: EnergyWeights
+    R: Float[Array, "poses 3 3"],
+    t: Float[Array, "poses 3"],
+    origin: Float[Array, "3"],
+    reference: Reference,
+    weights: EnergyWeights,
 ) -> Float[Array, ""]:
     """What the energy adds to eq. 2: the weighted terms that depend on the poses alone.
 

@@ -68,7 +68,9 @@ class AnnotatedMesh:
         grow = np.ones((4, 4))
         grow[:3, 3] = factor
         frames = {name: T * grow for name, T in self.frames.items()}
-        return dataclasses.replace(self, mesh=self.mesh.copy().apply_scale(factor), height=self.height * factor, frames=frames)
+        return dataclasses.replace(
+            self, mesh=self.mesh.copy().apply_scale(factor), height=self.height * factor, frames=frames
+        )
 
 
 def load_annotated(folder: str | Path) -> list[AnnotatedMesh]:
@@ -87,9 +89,13 @@ def _sidecar(folder: Path) -> dict:
     """The entries by file name, of the right shape but not yet checked in themselves."""
     path, expected = folder / SIDECAR, 'expected {"mug.obj": {"unit": 1, "up": "+z", "handle": "+x"}, ...}'
     if not folder.is_dir():
-        raise InputError(f"load_annotated(): there is no folder {folder}; expected one with meshes and their {SIDECAR}; check the path")
+        raise InputError(
+            f"load_annotated(): there is no folder {folder}; expected one with meshes and their {SIDECAR}; check the path"
+        )
     if not any(folder.iterdir()):
-        raise InputError(f"load_annotated(): the folder {folder} is empty; expected meshes and their {SIDECAR}; put them there")
+        raise InputError(
+            f"load_annotated(): the folder {folder} is empty; expected meshes and their {SIDECAR}; put them there"
+        )
     if not path.is_file():
         raise InputError(f"load_annotated(): {folder} has no {SIDECAR}; {expected}; write one")
     try:
@@ -99,7 +105,9 @@ def _sidecar(folder: Path) -> dict:
     if not isinstance(entries, dict) or not entries:
         got = "no entry" if entries == {} else f"a JSON {type(entries).__name__}"
         raise InputError(f"load_annotated(): {path} holds {got}; {expected}; correct it")
-    unnamed = sorted(file.name for file in folder.iterdir() if file.suffix.lower() in MESH_SUFFIXES and file.name not in entries)
+    unnamed = sorted(
+        file.name for file in folder.iterdir() if file.suffix.lower() in MESH_SUFFIXES and file.name not in entries
+    )
     if unnamed:
         raise InputError(
             f"load_annotated(): {path} has no entry for {', '.join(unnamed)}; expected one for each mesh; add it or move the file away"
@@ -107,7 +115,9 @@ def _sidecar(folder: Path) -> dict:
     stems = [Path(name).stem for name in entries]
     twice = sorted({stem for stem in stems if stems.count(stem) > 1})
     if twice:
-        raise InputError(f"load_annotated(): {path} has several meshes called {', '.join(twice)}; expected different names; rename one")
+        raise InputError(
+            f"load_annotated(): {path} has several meshes called {', '.join(twice)}; expected different names; rename one"
+        )
     return entries
 
 
@@ -150,7 +160,11 @@ def _checked(path: Path, entry) -> _Entry:
         refuse(f"category is {category!r}", f"one of {', '.join(FAMILIES)}")
     symmetries = {name: fold for fold, name in FOLDS.items()}
     symmetry = "none" if category == "mug" else entry.get("symmetry", "round")
-    needed = {"unit", "up", "handle"} if category == "mug" else {"unit", "up", "symmetry"} | ({"front"} if symmetry != "round" else set())
+    needed = (
+        {"unit", "up", "handle"}
+        if category == "mug"
+        else {"unit", "up", "symmetry"} | ({"front"} if symmetry != "round" else set())
+    )
     known = needed | {"category", "places"} | (set() if category == "mug" else {"front"})
     if not needed <= set(entry) <= known:
         refuse(f"the entry has the keys {', '.join(entry) or 'none'}", _wanted(category, symmetry != "round"))
@@ -159,7 +173,13 @@ def _checked(path: Path, entry) -> _Entry:
     unit = entry["unit"]
     if isinstance(unit, bool) or not isinstance(unit, int | float) or not 0 < unit < np.inf:
         refuse(f"unit is {unit!r}", "metres per unit of the file, a positive number")
-    return _Entry(category, symmetries[symmetry], float(unit), _axes(entry, category, refuse), _given_places(entry, category, refuse))
+    return _Entry(
+        category,
+        symmetries[symmetry],
+        float(unit),
+        _axes(entry, category, refuse),
+        _given_places(entry, category, refuse),
+    )
 
 
 def _wanted(category: str, has_front: bool) -> str:
@@ -178,7 +198,10 @@ def _axes(entry: dict, category: str, refuse) -> np.ndarray:
     if category != "mug" and isinstance(front, list):
         return _axes_of(up, front, refuse)
     if not isinstance(front, str) or front not in AXES:
-        refuse(f"{side} is {front!r}", f"one of {', '.join(AXES)}" + ("" if category == "mug" else ", or a direction [x, y, z]"))
+        refuse(
+            f"{side} is {front!r}",
+            f"one of {', '.join(AXES)}" + ("" if category == "mug" else ", or a direction [x, y, z]"),
+        )
     if AXES[up] @ AXES[front]:
         refuse(f"up is {up} and {side} {front}, which are parallel", "two different axes")
     return file_axes(up, front)
@@ -202,7 +225,8 @@ def _given_places(entry: dict, category: str, refuse) -> dict:
     if not isinstance(places, dict) or not set(places) <= set(names):
         refuse(f"places is {places!r}", f"an object with any of {', '.join(names)}")
     return {
-        name: _place(place, lambda got: refuse(f"the place {name} {got}", "a 4x4 matrix, a rotation and metres")) for name, place in places.items()
+        name: _place(place, lambda got: refuse(f"the place {name} {got}", "a 4x4 matrix, a rotation and metres"))
+        for name, place in places.items()
     }
 
 

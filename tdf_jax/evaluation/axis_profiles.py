@@ -88,7 +88,9 @@ def profile(mesh: "trimesh.Trimesh", category: str, fold: int, name: str) -> Pro
     return Profile(origin, height, sections, radii, _turned(around, fold))
 
 
-def profile_places(found: Profile, category: str, fold: int, name: str, places: Collection[str]) -> dict[str, Float[np.ndarray, "4 4"]]:
+def profile_places(
+    found: Profile, category: str, fold: int, name: str, places: Collection[str]
+) -> dict[str, Float[np.ndarray, "4 4"]]:
     """Frames of the places of a bowl or bottle.
 
     Args:
@@ -127,7 +129,9 @@ def _axis(mesh, shares: tuple[float, float], name: str) -> np.ndarray:
 
     low, high = mesh.bounds[:, 2]
     levels = low + (high - low) * (shares[0] + (shares[1] - shares[0]) * (np.arange(AXIS_LEVELS) + 0.5) / AXIS_LEVELS)
-    cuts = (mesh_plane(mesh, plane_normal=[0, 0, 1], plane_origin=[0, 0, level])[..., :2].reshape(-1, 2) for level in levels)
+    cuts = (
+        mesh_plane(mesh, plane_normal=[0, 0, 1], plane_origin=[0, 0, level])[..., :2].reshape(-1, 2) for level in levels
+    )
     # The middle of an outline is its axis for every symmetry, while the mean of its points follows how densely a side
     # was scanned; the middle of the whole box is thrown off by one stray vertex, and of a scanned bowl by 0.4 mm by its
     # leaning rim.
@@ -220,7 +224,9 @@ def _bottle_levels(found: Profile, fold: int, name: str) -> tuple[float, float]:
     radius, height, wanted = _mean_radius(found, fold), found.height, "a bottle with a neck above its body"
     width = float(np.nanmax(_widths(found)))
     if width > height:  # of one that lies, a handle would be the neck
-        raise _unmeasured(name, f"it is {100 * width:.1f} cm wide and {100 * height:.1f} cm high; is 'up' right?", wanted)
+        raise _unmeasured(
+            name, f"it is {100 * width:.1f} cm wide and {100 * height:.1f} cm high; is 'up' right?", wanted
+        )
     levels = _levels(height) + height / 2
     body = float(np.quantile(radius[: LEVELS // 2], 0.9))  # not the greatest: a seam; not the median: a waist
     neck = float(np.quantile(radius[LEVELS // 2 :], 0.2))
@@ -265,8 +271,10 @@ def _shoulder_from(levels: np.ndarray, radius: np.ndarray, half_way: float, neck
         wide = (1 + np.cos(np.pi * share)) / 2 if curve is None else np.maximum(1 - share**curve, 0) ** (1 / curve)
         rest = radius - neck * (1 - wide)
         # Least squares for the body's radius, which `wide` scales, and its bulge.
-        ww, wb, bb, wr, br = (np.sum(one * other, axis=1, keepdims=True) for one, other in
-                              ((wide, wide), (wide, bulge), (bulge, bulge), (wide, rest), (bulge, rest)))
+        ww, wb, bb, wr, br = (
+            np.sum(one * other, axis=1, keepdims=True)
+            for one, other in ((wide, wide), (wide, bulge), (bulge, bulge), (wide, rest), (bulge, rest))
+        )
         body, out = np.array([bb * wr - wb * br, ww * br - wb * wr]) / (ww * bb - wb**2)
         off = np.abs(rest - body * wide - out * bulge).sum(axis=1)  # not squared: seams and labels
         off[(start + (half_way - start) / middle > height)[:, 0]] = np.inf  # its neck would begin above the top
@@ -276,4 +284,6 @@ def _shoulder_from(levels: np.ndarray, radius: np.ndarray, half_way: float, neck
 
 
 def _unmeasured(name: str, what: str, expected: str) -> InputError:
-    return InputError(f"profile_places(): {name} cannot be measured: {what} Expected {expected}: correct its 'up', or give 'places' for it")
+    return InputError(
+        f"profile_places(): {name} cannot be measured: {what} Expected {expected}: correct its 'up', or give 'places' for it"
+    )

@@ -46,7 +46,9 @@ def principal_axes(
 
 
 def iterative_closest_points(
-    points_a: Float[np.ndarray, "points 3"], points_b: Float[np.ndarray, "seen 3"], rotations: Float[np.ndarray, "starts 3 3"]
+    points_a: Float[np.ndarray, "points 3"],
+    points_b: Float[np.ndarray, "seen 3"],
+    rotations: Float[np.ndarray, "starts 3 3"],
 ) -> Float[np.ndarray, "4 4"]:
     """Point-to-point ICP from several starts; the one of least mean squared distance.
 
@@ -67,7 +69,9 @@ def iterative_closest_points(
 
 
 def settled_points(
-    points_a: Float[np.ndarray, "points 3"], points_b: Float[np.ndarray, "seen 3"], rotations: Float[np.ndarray, "starts 3 3"]
+    points_a: Float[np.ndarray, "points 3"],
+    points_b: Float[np.ndarray, "seen 3"],
+    rotations: Float[np.ndarray, "starts 3 3"],
 ) -> tuple[Float[np.ndarray, "starts 4 4"], Float[np.ndarray, " starts"]]:
     """Where point-to-point ICP settles from every start, see `iterative_closest_points`.
 
@@ -83,7 +87,9 @@ def settled_points(
     return np.linalg.inv(motions), np.array(costs)
 
 
-def rigid_motion(points_a: Float[np.ndarray, "points 3"], points_b: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "4 4"]:
+def rigid_motion(
+    points_a: Float[np.ndarray, "points 3"], points_b: Float[np.ndarray, "points 3"]
+) -> Float[np.ndarray, "4 4"]:
     """The motion of least squares of points onto those they correspond to, 4x4, without reflection or scale."""
     from trimesh.registration import procrustes
 

@@ -93,7 +93,9 @@ def mug_of(seed: int, index: int, height: float) -> Mug:
 
 def random_pose(seed: int, index: int, reach: float = 0.3) -> Float[np.ndarray, "4 4"]:
     """A rotation uniform on SO(3) and a translation uniform in a cube of half side `reach`, metres."""
-    rotation_key, place_key = jax.random.split(jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), POSE_STREAM), index))
+    rotation_key, place_key = jax.random.split(
+        jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), POSE_STREAM), index)
+    )
     T = np.eye(4)
     T[:3, :3] = poses.uniform_rotations(rotation_key, 1)[0]
     T[:3, 3] = jax.random.uniform(place_key, (3,), minval=-reach, maxval=reach)
@@ -164,7 +166,14 @@ def _scale(function: str, clouds: str) -> float:
 
 
 def _case(
-    a: Shape, b: Shape | AnnotatedMesh, seed: int, number: int, points: int, place: str | None, clouds: str, instance: str
+    a: Shape,
+    b: Shape | AnnotatedMesh,
+    seed: int,
+    number: int,
+    points: int,
+    place: str | None,
+    clouds: str,
+    instance: str,
 ) -> Case:
     places = FAMILIES[a.category].places
     place = places[0] if place is None else place

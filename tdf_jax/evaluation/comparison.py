@@ -86,4 +86,6 @@ def random_weights(model: Model, seed: int) -> Model:
 
 def _outcome(method, cases, found, ious, seed) -> Outcome:
     distance, angle = place_errors(found, cases)
-    return Outcome(method, cases, found, distance, angle, ious, summary(distance, angle, ious, cases, seed, tilts(found, cases)))
+    return Outcome(
+        method, cases, found, distance, angle, ious, summary(distance, angle, ious, cases, seed, tilts(found, cases))
+    )

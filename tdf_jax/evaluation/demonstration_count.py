@@ -43,7 +43,13 @@ class Learnt:
 
 
 def learnt(
-    makers: Sequence[Callable[[], Task]], model: Model, counts: Sequence[int], folder: Path, *, seed: int = 0, progress: bool = True
+    makers: Sequence[Callable[[], Task]],
+    model: Model,
+    counts: Sequence[int],
+    folder: Path,
+    *,
+    seed: int = 0,
+    progress: bool = True,
 ) -> list[Learnt]:
     """Picks on the targets of every fifth task, learnt from 1, 3, ... demonstrations at the place of other mugs of the same height.
 
@@ -66,7 +72,13 @@ def learnt(
         for count in counts:
             for way in COMBINATIONS if count > 1 else COMBINATIONS[:1]:
                 what = [*about, *task.identity, count, way]
-                found = kept("tdf benchmark", folder, what, lambda count=count, way=way: _pick(task, model, shown()[:count], way, seed), _errors)
+                found = kept(
+                    "tdf benchmark",
+                    folder,
+                    what,
+                    lambda count=count, way=way: _pick(task, model, shown()[:count], way, seed),
+                    _errors,
+                )
                 groups.setdefault((task.case.clouds, count, way), []).append(found)
     return [Learnt(*name, *map(list, zip(*found))) for name, found in groups.items()]
 
@@ -77,7 +89,9 @@ def _demonstrations(task, seed, count) -> list[Demonstration]:
     parameters = task.case.object_a.parameters
     for number in range(count):
         mug = mug_of(seed, MUGS + MOST * task.index + number, parameters.height)
-        pose = poses.pose(*(jnp.asarray(part, jnp.float32) for part in (mug.handle_frame[:3, :3], mug.handle_frame[:3, 3])))
+        pose = poses.pose(
+            *(jnp.asarray(part, jnp.float32) for part in (mug.handle_frame[:3, :3], mug.handle_frame[:3, 3]))
+        )
         points = sample_surface(mug.mesh, POINTS, number).astype(np.float32)
         shown.append(Demonstration(points, Trajectory(pose[None]), task.demonstration.query))
     return shown

@@ -160,9 +160,15 @@ def _oracle(task, *_) -> Attempt | None:
 def _descriptor_fields(task, model, encoded, key, inits, *, rigidly=False) -> Attempt:
     """NDF: one pose by Adam at the pick."""
     if inits not in encoded.picks:
-        picked = Reference(encoded.reference.descriptors[:1], Trajectory(encoded.reference.trajectory.wxyz_xyz[:1]), encoded.reference.query)
+        picked = Reference(
+            encoded.reference.descriptors[:1],
+            Trajectory(encoded.reference.trajectory.wxyz_xyz[:1]),
+            encoded.reference.query,
+        )
         began = time.perf_counter()
-        result = optimize(encoded.field, picked, key, fix_last=False, energy=EnergyWeights(0.0), config=OptimizeConfig(inits=inits))
+        result = optimize(
+            encoded.field, picked, key, fix_last=False, energy=EnergyWeights(0.0), config=OptimizeConfig(inits=inits)
+        )
         jax.block_until_ready(result)
         seconds = time.perf_counter() - began + encoded.seconds
         encoded.picks[inits] = np.asarray(result.trajectories[:, 0]), np.asarray(result.energies), seconds
@@ -191,7 +197,9 @@ def _paper(energy: EnergyWeights) -> Callable:
 
     def method(task, model, encoded, key, inits):
         goal, config = jnp.asarray(task.goal), SolveConfig(inits=inits)
-        return _timed(encoded, lambda: solve(encoded.field, encoded.reference, key, goal=goal, energy=energy, config=config))
+        return _timed(
+            encoded, lambda: solve(encoded.field, encoded.reference, key, goal=goal, energy=energy, config=config)
+        )
 
     return method
 
@@ -214,7 +222,9 @@ def _about_carried(energy: EnergyWeights) -> Callable:
 def _compensated(task, model, encoded, key, inits) -> Attempt:
     """Eq. 6 couples the waypoints: Adam."""
     goal, config = jnp.asarray(task.goal), OptimizeConfig(inits=inits)
-    return _timed(encoded, lambda: optimize(encoded.field, encoded.reference, key, goal=goal, energy=COMPENSATOR, config=config))
+    return _timed(
+        encoded, lambda: optimize(encoded.field, encoded.reference, key, goal=goal, energy=COMPENSATOR, config=config)
+    )
 
 
 METHODS: dict[str, Callable] = {
@@ -237,7 +247,13 @@ METHODS: dict[str, Callable] = {
 NETWORKS = (*(name for name in METHODS if name.startswith("NDF")), *PAPER, COMPENSATED, *ABOUT_CARRIED, LIBRARY)
 # Variants are tried on every fifth task, which are of all paths with all goals too: all of them would take as long as
 # the rest together.
-VARIANTS = (*(name for name in METHODS if f"{MANY} starts" in name), "random weights", *(name for name in PAPER if name != "TDF, k = 0.02"), COMPENSATED, *ABOUT_CARRIED)
+VARIANTS = (
+    *(name for name in METHODS if f"{MANY} starts" in name),
+    "random weights",
+    *(name for name in PAPER if name != "TDF, k = 0.02"),
+    COMPENSATED,
+    *ABOUT_CARRIED,
+)
 EVERY = 5
 
 

@@ -42,7 +42,10 @@ def expected_trajectory(
 
 
 def nearest_place(
-    T_world_object: Float[np.ndarray, "4 4"], T_world_found: Float[np.ndarray, "4 4"], T_world_place: Float[np.ndarray, "4 4"], fold: int
+    T_world_object: Float[np.ndarray, "4 4"],
+    T_world_found: Float[np.ndarray, "4 4"],
+    T_world_place: Float[np.ndarray, "4 4"],
+    fold: int,
 ) -> Float[np.ndarray, "4 4"]:
     """Of the places that an object's symmetry makes equal, the one nearest to where one was found.
 
@@ -133,7 +136,10 @@ def longest_step(path: Float[np.ndarray, "poses 3"]) -> float:
 
 
 def penetration(
-    trajectory: Trajectory, query: Float[np.ndarray, "queries 3"], target: Mug | AnnotatedMesh, T_world_target: Float[np.ndarray, "4 4"]
+    trajectory: Trajectory,
+    query: Float[np.ndarray, "queries 3"],
+    target: Mug | AnnotatedMesh,
+    T_world_target: Float[np.ndarray, "4 4"],
 ) -> float | None:
     """Share of the query points, over all poses, that lie in the object's clay. A query about a handle has some there by right: compare with the truth's.
 

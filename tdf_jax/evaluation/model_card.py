@@ -46,20 +46,52 @@ def card(model: Model, outcomes: Outcomes, settings: dict) -> str:
     }
     if model.info.description:
         facts["notes"] = model.info.description
-    lines = [f"# {model.info.name}", "", "| what | value |", "|---|---|", *(f"| {what} | {value} |" for what, value in facts.items()), ""]
+    lines = [
+        f"# {model.info.name}",
+        "",
+        "| what | value |",
+        "|---|---|",
+        *(f"| {what} | {value} |" for what, value in facts.items()),
+        "",
+    ]
     lines += ["## Transfer of one pose", "", _told(settings), ""]
     for objects in dict.fromkeys(name for name, _ in outcomes):
-        rows = [(clouds, outcome) for (name, clouds), several in outcomes.items() if name == objects for outcome in several]
+        rows = [
+            (clouds, outcome) for (name, clouds), several in outcomes.items() if name == objects for outcome in several
+        ]
         first = rows[0][1].summary
         kind = "at their own size, none seen in training" if is_real(objects) else "that no training run saw"
-        lines += [f"{objects.capitalize()}: {first['objects']} {kind}, {first['cases']} transfers of the {place(objects, settings)}.", ""]
-        heads = ["cloud", "method", "IoU", "refined", "position, median / 90 %", "rotation, median / 90 %", "flips", *THRESHOLDS.values()]
+        lines += [
+            f"{objects.capitalize()}: {first['objects']} {kind}, {first['cases']} transfers of the {place(objects, settings)}.",
+            "",
+        ]
+        heads = [
+            "cloud",
+            "method",
+            "IoU",
+            "refined",
+            "position, median / 90 %",
+            "rotation, median / 90 %",
+            "flips",
+            *THRESHOLDS.values(),
+        ]
         lines += [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
         lines += [f"| {' | '.join(_cells(clouds, outcome))} |" for clouds, outcome in rows]
-        apart = [[MEANINGS[clouds], outcome.method, *cells] for clouds, outcome in rows for cells in by_symmetry(outcome.summary)]
+        apart = [
+            [MEANINGS[clouds], outcome.method, *cells]
+            for clouds, outcome in rows
+            for cells in by_symmetry(outcome.summary)
+        ]
         if apart:
             heads = ["cloud", "method", *SYMMETRY_HEADS]
-            lines += ["", "The same by symmetry:", "", f"| {' | '.join(heads)} |", "|" + "---|" * len(heads), *(f"| {' | '.join(cells)} |" for cells in apart)]
+            lines += [
+                "",
+                "The same by symmetry:",
+                "",
+                f"| {' | '.join(heads)} |",
+                "|" + "---|" * len(heads),
+                *(f"| {' | '.join(cells)} |" for cells in apart),
+            ]
         lines += [""]
     return "\n".join(lines).rstrip() + "\n"
 

@@ -16,7 +16,12 @@ from tdf_jax.evaluation.path_scores import MISSED, THRESHOLDS, Score, by_method,
 from tdf_jax.networks.model import Model
 from tdf_jax.uncertainty.calibration import FITTED_ON, bins, calibration_error, ranking
 
-PICTURES = {"truth": "truth.png", "errors": "errors.png", "reliability": "reliability.png", "demonstrations": "demonstrations.png"}
+PICTURES = {
+    "truth": "truth.png",
+    "errors": "errors.png",
+    "reliability": "reliability.png",
+    "demonstrations": "demonstrations.png",
+}
 SCHEMA = 1  # raised when a field of the file changes its meaning or goes
 WORDS = {"1cm_10deg": "1 cm, 10°", "2cm_20deg": "2 cm, 20°", "5cm_30deg": "5 cm, 30°"}
 LISTED = 12  # failures that are told one by one
@@ -31,11 +36,19 @@ def page(scores: Sequence[Score], model: Model, settings: Mapping[str, Any], ext
         settings: of the command.
         extras: of `sections`.
     """
-    conditions = {clouds: [one for one in scores if one.clouds == clouds] for clouds in dict.fromkeys(one.clouds for one in scores)}
+    conditions = {
+        clouds: [one for one in scores if one.clouds == clouds]
+        for clouds in dict.fromkeys(one.clouds for one in scores)
+    }
     parts = ["# Benchmark", _told(scores, model, settings), f"![True trajectories of six tasks]({PICTURES['truth']})"]
     for number, (clouds, several) in enumerate(conditions.items()):
         groups = by_method(several)
-        parts += [f"## Clouds: {clouds}", _picks(groups), _paths(groups), _split(groups, "displacement", tasks.DISPLACEMENTS)]
+        parts += [
+            f"## Clouds: {clouds}",
+            _picks(groups),
+            _paths(groups),
+            _split(groups, "displacement", tasks.DISPLACEMENTS),
+        ]
         if number == 0:
             parts += [_split(groups, "path", tasks.PATHS), f"![Errors of picks and paths]({PICTURES['errors']})"]
     parts += [_failures(scores)]
@@ -82,7 +95,12 @@ def sections(scores: Sequence[Score], picks: Sequence[Learnt]) -> dict[str, Any]
         predicted = np.array([one.confidence for one in sure])
         right = np.array([one.succeeds(*MISSED) for one in sure], float)
         rows = bins(predicted, right)
-        extras["reliability"] = {"picks": len(sure), "bins": rows, "calibration_error": calibration_error(rows), "ranking": ranking(predicted, right)}
+        extras["reliability"] = {
+            "picks": len(sure),
+            "bins": rows,
+            "calibration_error": calibration_error(rows),
+            "ranking": ranking(predicted, right),
+        }
     if picks:
         extras["demonstrations"] = [dataclasses.asdict(one) for one in picks]
     return extras
@@ -96,8 +114,16 @@ def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def _told(scores, model, settings) -> str:
     objects = len({one.instance for one in scores})
-    options = {name: value for name, value in settings.items() if value not in (None, (), ("all",)) and (name != "poses" or settings["meshes"])}
-    words = [word for name, value in options.items() for word in (f"--{name}", *(value if isinstance(value, tuple) else (value,)))]
+    options = {
+        name: value
+        for name, value in settings.items()
+        if value not in (None, (), ("all",)) and (name != "poses" or settings["meshes"])
+    }
+    words = [
+        word
+        for name, value in options.items()
+        for word in (f"--{name}", *(value if isinstance(value, tuple) else (value,)))
+    ]
     command = shlex.join(["tdf", "benchmark", *map(str, words)])
     return (
         f"`{command}`: {objects} objects, weights `{model.info.name}`, {settings['inits']} starts of ICP and of Adam (NDF, random weights, l_p). `tdf_jax` and the solver of *TDF* scout from 64 starts with 16 query points; variants of ICP and NDF take "
@@ -112,13 +138,30 @@ def _told(scores, model, settings) -> str:
 
 
 def _picks(groups: Mapping[str, list[Score]]) -> str:
-    heads = ["method", "tasks", "pick, cm: median / 90 %", "degrees: median / 90 %", "flips", *WORDS.values(), "best, 1 cm, 10°", "seconds"]
+    heads = [
+        "method",
+        "tasks",
+        "pick, cm: median / 90 %",
+        "degrees: median / 90 %",
+        "flips",
+        *WORDS.values(),
+        "best, 1 cm, 10°",
+        "seconds",
+    ]
     rows = []
     for method, several in groups.items():
         row = summarised(several)
-        cells = [_name(method), str(row["tasks"]), f"{row['pick_median_cm']:.2f} / {row['pick_p90_cm']:.2f}", f"{row['pick_median_deg']:.1f} / {row['pick_p90_deg']:.1f}", str(row["flips"])]
+        cells = [
+            _name(method),
+            str(row["tasks"]),
+            f"{row['pick_median_cm']:.2f} / {row['pick_p90_cm']:.2f}",
+            f"{row['pick_median_deg']:.1f} / {row['pick_p90_deg']:.1f}",
+            str(row["flips"]),
+        ]
         cells += [f"{100 * row[f'success_{name}']:.0f} %{_between(row[f'interval_{name}'], 100)}" for name in WORDS]
-        rows.append([*cells, f"{100 * row['oracle_1cm_10deg']:.0f} % of {several[0].starts}", f"{row['seconds_median']:.2g}"])
+        rows.append(
+            [*cells, f"{100 * row['oracle_1cm_10deg']:.0f} % of {several[0].starts}", f"{row['seconds_median']:.2g}"]
+        )
     return "Picks:\n\n" + markdown(heads, rows)
 
 
@@ -129,8 +172,15 @@ def _paths(groups: Mapping[str, list[Score]]) -> str:
     rows = []
     for method, several in groups.items():
         row = summarised(several)
-        cells = [_name(method), f"{row['path_median_cm']:.2f}{_between(row['interval_path_median_cm'], 1, 2)} / {row['path_p90_cm']:.2f}", f"{row['oracle_path_median_cm']:.2f}"]
-        cells += [f"{row['waypoint_median_cm']:.2f} / {row['waypoint_p90_cm']:.2f}", f"{row['waypoint_median_deg']:.1f} / {row['waypoint_p90_deg']:.1f}"]
+        cells = [
+            _name(method),
+            f"{row['path_median_cm']:.2f}{_between(row['interval_path_median_cm'], 1, 2)} / {row['path_p90_cm']:.2f}",
+            f"{row['oracle_path_median_cm']:.2f}",
+        ]
+        cells += [
+            f"{row['waypoint_median_cm']:.2f} / {row['waypoint_p90_cm']:.2f}",
+            f"{row['waypoint_median_deg']:.1f} / {row['waypoint_p90_deg']:.1f}",
+        ]
         cells += [f"{row['frechet_median_cm']:.2f}", f"{row['jerk_median']:.2f}", f"{row['longest_step_median']:.2f}"]
         rows.append([*cells, "n/a" if row["penetration_mean"] is None else f"{100 * row['penetration_mean']:+.1f} %"])
     step = summarised(next(iter(groups.values())))["expected_step_median"]
@@ -149,9 +199,13 @@ def _split(groups: Mapping[str, list[Score]], by: str, values: Iterable[str]) ->
         for value in values:
             chosen = [one for one in several if getattr(one, by) == value]
             errors = 100 * np.array([one.path_error for one in chosen])
-            cells.append(f"{np.median(errors):.2f}{_between(interval(chosen, errors, np.median, 0), 1, 2)}" if chosen else "n/a")
+            cells.append(
+                f"{np.median(errors):.2f}{_between(interval(chosen, errors, np.median, 0), 1, 2)}" if chosen else "n/a"
+            )
         rows.append([_name(method), *cells])
-    return f"Path error, cm, median, by {by}:\n\n" + markdown(["method", *(str(value).replace("_", " ") for value in values)], rows)
+    return f"Path error, cm, median, by {by}:\n\n" + markdown(
+        ["method", *(str(value).replace("_", " ") for value in values)], rows
+    )
 
 
 def _failures(scores: Sequence[Score]) -> str:
@@ -163,7 +217,15 @@ def _failures(scores: Sequence[Score]) -> str:
     known = sum(one.best_pick[0] <= MISSED[0] and one.best_pick[1] <= MISSED[1] for one in failed)
     heads = ["object", "cloud", "path", "pick, cm", "degrees", "best, cm", "degrees"]
     rows = [
-        [one.instance, one.clouds, one.path.replace("_", " "), f"{100 * one.distances[0]:.1f}", f"{one.angles[0]:.0f}", f"{100 * one.best_pick[0]:.1f}", f"{one.best_pick[1]:.0f}"]
+        [
+            one.instance,
+            one.clouds,
+            one.path.replace("_", " "),
+            f"{100 * one.distances[0]:.1f}",
+            f"{one.angles[0]:.0f}",
+            f"{100 * one.best_pick[0]:.1f}",
+            f"{one.best_pick[1]:.0f}",
+        ]
         for one in failed[:LISTED]
     ]
     counted = f" The {LISTED} with the largest turns:" if len(failed) > LISTED else ""
@@ -172,11 +234,24 @@ def _failures(scores: Sequence[Score]) -> str:
 
 def _reliability(found: Mapping[str, Any]) -> str:
     heads = ["confidence, mean of a bin", "picks", "within 2 cm and 20°", "95 % interval"]
-    rows = [[f"{one['predicted']:.3f}", str(one["picks"]), f"{one['right']:.3f}", "{:.2f} to {:.2f}".format(*one["interval"])] for one in found["bins"]]
-    order = "" if found["ranking"] is None else f" Of a right and a wrong pick the right one has the higher confidence in {100 * found['ranking']:.0f} % of pairs."
+    rows = [
+        [
+            f"{one['predicted']:.3f}",
+            str(one["picks"]),
+            f"{one['right']:.3f}",
+            "{:.2f} to {:.2f}".format(*one["interval"]),
+        ]
+        for one in found["bins"]
+    ]
+    order = (
+        ""
+        if found["ranking"] is None
+        else f" Of a right and a wrong pick the right one has the higher confidence in {100 * found['ranking']:.0f} % of pairs."
+    )
     return (
         f"## Confidence\n\n`result.confidence` of the {found['picks']} picks of `{LIBRARY}`, all clouds, in bins. It was fitted on picks of seed {FITTED_ON}. "
-        f"Mean difference of confidence and share: {found['calibration_error']:.3f}.{order}\n\n![Reliability]({PICTURES['reliability']})\n\n" + markdown(heads, rows)
+        f"Mean difference of confidence and share: {found['calibration_error']:.3f}.{order}\n\n![Reliability]({PICTURES['reliability']})\n\n"
+        + markdown(heads, rows)
     )
 
 
@@ -186,10 +261,23 @@ def _demonstrations(found: Sequence[Mapping[str, Any]]) -> str:
     for one in found:
         cells = [one["clouds"], str(one["count"]), one["way"], str(len(one["distances"]))]
         distance, angle = 100 * np.array(one["distances"]), np.array(one["angles"])
-        cells += [f"{np.median(values):.{d}f} / {np.percentile(values, 90):.{d}f}" for values, d in ((distance, 2), (angle, 1))]
-        rows.append([*cells, *(f"{100 * np.mean((distance <= 100 * metres) & (angle <= degrees)):.0f} %" for metres, degrees in THRESHOLDS.values())])
+        cells += [
+            f"{np.median(values):.{d}f} / {np.percentile(values, 90):.{d}f}"
+            for values, d in ((distance, 2), (angle, 1))
+        ]
+        rows.append(
+            [
+                *cells,
+                *(
+                    f"{100 * np.mean((distance <= 100 * metres) & (angle <= degrees)):.0f} %"
+                    for metres, degrees in THRESHOLDS.values()
+                ),
+            ]
+        )
     told = "## Several demonstrations\n\nPicks on the targets of every fifth task, learnt from the handles of several other mugs."
-    return f"{told}\n\n![Success against the number of demonstrations]({PICTURES['demonstrations']})\n\n" + markdown(heads, rows)
+    return f"{told}\n\n![Success against the number of demonstrations]({PICTURES['demonstrations']})\n\n" + markdown(
+        heads, rows
+    )
 
 
 def _name(method: str) -> str:

@@ -17,7 +17,14 @@ FORMAT = 1  # of what is kept: raised when an attempt is computed otherwise
 
 
 def run(
-    makers: Sequence[Callable[[], Task]], model: Model, methods: Sequence[str], folder: Path, *, seed: int = 0, inits: int = 10, progress: bool = True
+    makers: Sequence[Callable[[], Task]],
+    model: Model,
+    methods: Sequence[str],
+    folder: Path,
+    *,
+    seed: int = 0,
+    inits: int = 10,
+    progress: bool = True,
 ) -> Iterator[tuple[Task, str, Attempt]]:
     """Attempts of methods on tasks.
 
@@ -61,4 +68,3 @@ def _attempt(arrays) -> Attempt | None:
     if not arrays:
         return None
     return Attempt(arrays["trajectories"], arrays["scores"], float(arrays["seconds"]), float(arrays["residual"]))
-

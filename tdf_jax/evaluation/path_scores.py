@@ -78,7 +78,10 @@ def score(method: str, attempt: Attempt, task: Task) -> Score:
     best, nearest = attempt.best, int(np.argmin(distance[:, 0] / 0.01 + angle[:, 0] / 10.0))
     chosen = Trajectory(trajectories[best])
     places, truth = np.asarray(chosen.translations), np.asarray(task.expected.translations)
-    inside = [penetration(path, np.asarray(task.demonstration.query), task.case.object_b, task.case.T_world_b) for path in (chosen, task.expected)]
+    inside = [
+        penetration(path, np.asarray(task.demonstration.query), task.case.object_b, task.case.T_world_b)
+        for path in (chosen, task.expected)
+    ]
     return Score(
         method=method,
         task=task.index,
@@ -113,13 +116,27 @@ def summarised(scores: Sequence[Score], seed: int = 0) -> dict:
     """
     picks, turns = (np.array([values[0] for values in several]) for several in _both(scores))
     ways, angles = (np.concatenate([values[:-1] for values in several]) for several in _both(scores))
-    row = {"tasks": len(scores), "objects": len({one.instance for one in scores}), "flips": int(np.sum(turns > FLIP_DEGREES))}
-    for name, values, unit in (("pick", 100 * picks, "cm"), ("pick", turns, "deg"), ("waypoint", 100 * ways, "cm"), ("waypoint", angles, "deg")):
-        row |= {f"{name}_median_{unit}": float(np.median(values)), f"{name}_p90_{unit}": float(np.percentile(values, 90))}
+    row = {
+        "tasks": len(scores),
+        "objects": len({one.instance for one in scores}),
+        "flips": int(np.sum(turns > FLIP_DEGREES)),
+    }
+    for name, values, unit in (
+        ("pick", 100 * picks, "cm"),
+        ("pick", turns, "deg"),
+        ("waypoint", 100 * ways, "cm"),
+        ("waypoint", angles, "deg"),
+    ):
+        row |= {
+            f"{name}_median_{unit}": float(np.median(values)),
+            f"{name}_p90_{unit}": float(np.percentile(values, 90)),
+        }
     for name, (metres, degrees) in THRESHOLDS.items():
         hits = np.array([one.succeeds(metres, degrees) for one in scores], float)
         row[f"success_{name}"], row[f"interval_{name}"] = float(hits.mean()), interval(scores, hits, np.mean, seed)
-        row[f"oracle_{name}"] = float(np.mean([one.best_pick[0] <= metres and one.best_pick[1] <= degrees for one in scores]))
+        row[f"oracle_{name}"] = float(
+            np.mean([one.best_pick[0] <= metres and one.best_pick[1] <= degrees for one in scores])
+        )
     paths = 100 * np.array([one.path_error for one in scores])
     row["path_median_cm"], row["path_p90_cm"] = float(np.median(paths)), float(np.percentile(paths, 90))
     row["interval_path_median_cm"] = interval(scores, paths, np.median, seed)
@@ -132,14 +149,18 @@ def summarised(scores: Sequence[Score], seed: int = 0) -> dict:
     return row
 
 
-def interval(scores: Sequence[Score], values: Float[np.ndarray, " tasks"], statistic: Callable, seed: int) -> list[float] | None:
+def interval(
+    scores: Sequence[Score], values: Float[np.ndarray, " tasks"], statistic: Callable, seed: int
+) -> list[float] | None:
     """95 % bootstrap interval of a statistic; whole objects are drawn, each with all of its tasks. None for a single object."""
     names = list(dict.fromkeys(one.instance for one in scores))
     if len(names) < 2:
         return None
     groups = [np.array([value for one, value in zip(scores, values) if one.instance == name]) for name in names]
     rng = np.random.default_rng(seed)
-    drawn = [statistic(np.concatenate([groups[i] for i in rng.choice(len(groups), len(groups))])) for _ in range(RESAMPLES)]
+    drawn = [
+        statistic(np.concatenate([groups[i] for i in rng.choice(len(groups), len(groups))])) for _ in range(RESAMPLES)
+    ]
     return [float(x) for x in np.percentile(drawn, (2.5, 97.5))]
 
 

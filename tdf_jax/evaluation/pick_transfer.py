@@ -27,7 +27,12 @@ QUERY_SIZE = 0.06  # metres, of the box around the place: the handle and the wal
 
 
 def transferred(
-    model: Model, cases: Sequence[Transfer], *, seed: int = 0, config: OptimizeConfig = OptimizeConfig(), progress: bool = True
+    model: Model,
+    cases: Sequence[Transfer],
+    *,
+    seed: int = 0,
+    config: OptimizeConfig = OptimizeConfig(),
+    progress: bool = True,
 ) -> Float[np.ndarray, "cases 7"]:
     """Transfer the place's pose in every case; of the starts, the one with the least loss counts.
 
@@ -58,7 +63,10 @@ def place_errors(
     """Position errors, metres, and rotation errors, degrees, of poses found for cases: from the nearest of a symmetric object's true poses."""
     T_world_found = np.asarray(Trajectory(jnp.asarray(found)).matrices, float)
     truth = np.stack(
-        [nearest_place(case.T_world_b, T, case.T_world_place_b, case.fold) for T, case in zip(T_world_found, cases, strict=True)]
+        [
+            nearest_place(case.T_world_b, T, case.T_world_place_b, case.fold)
+            for T, case in zip(T_world_found, cases, strict=True)
+        ]
     ).astype(np.float32)
     distance, angle = pose_error(found, poses.pose(truth[:, :3, :3], truth[:, :3, 3]))
     return distance, np.degrees(angle)
@@ -80,7 +88,9 @@ def place_reference(model: Model, case: Transfer, query: Float[Array, "queries 3
     return Reference(_describe(field, T_world_query, query)[None], shown, query)
 
 
-def overlaps(model: Model, cases: Sequence[Case], samples: int = 20_000, seed: int = 0) -> dict[str, list[float | None]]:
+def overlaps(
+    model: Model, cases: Sequence[Case], samples: int = 20_000, seed: int = 0
+) -> dict[str, list[float | None]]:
     """Intersection over union of the reconstructed and the true object b, at occupancy 0.5, in every case.
 
     Args:

@@ -40,9 +40,14 @@ def table(outcomes: Outcomes, settings: dict) -> str:
     told = f"best of {settings['inits']} starts by loss"
     lines = []
     for objects in dict.fromkeys(name for name, _ in outcomes):
-        rows = [(clouds, outcome) for (name, clouds), several in outcomes.items() if name == objects for outcome in several]
+        rows = [
+            (clouds, outcome) for (name, clouds), several in outcomes.items() if name == objects for outcome in several
+        ]
         first = rows[0][1].summary
-        lines += ["", f"{objects}: {first['objects']} objects, {first['cases']} transfers of the {place(objects, settings)}; {told}"]
+        lines += [
+            "",
+            f"{objects}: {first['objects']} objects, {first['cases']} transfers of the {place(objects, settings)}; {told}",
+        ]
         lines += _aligned([_HEADS, _UNITS, *(_cells(clouds, outcome) for clouds, outcome in rows)])
         apart = [(outcome.method, clouds, *cells) for clouds, outcome in rows for cells in by_symmetry(outcome.summary)]
         if apart:
@@ -51,7 +56,17 @@ def table(outcomes: Outcomes, settings: dict) -> str:
 
 
 SYMMETRY_HEADS = ["symmetry", "cases", "IoU", "refined", *THRESHOLDS.values(), "axis: 2 cm, 20 deg"]
-_HEADS = ["method", "cloud", "IoU", "refined", "position, cm", "position, diagonals", "rotation, deg", "flips", *THRESHOLDS.values()]
+_HEADS = [
+    "method",
+    "cloud",
+    "IoU",
+    "refined",
+    "position, cm",
+    "position, diagonals",
+    "rotation, deg",
+    "flips",
+    *THRESHOLDS.values(),
+]
 _UNITS = ["", "", "", "", *["median / p90"] * 3, "", *["success (95 %)"] * 3]
 
 
@@ -69,7 +84,12 @@ def by_symmetry(row: dict) -> list[list[str]]:
     if len(parts) < 2:
         return []
     return [
-        [name, str(part["cases"]), *overlap_cells(part), *(_percent(part[f"success_{threshold}"]) for threshold in (*THRESHOLDS, "axis_2cm_20deg"))]
+        [
+            name,
+            str(part["cases"]),
+            *overlap_cells(part),
+            *(_percent(part[f"success_{threshold}"]) for threshold in (*THRESHOLDS, "axis_2cm_20deg")),
+        ]
         for name, part in parts.items()
     ]
 
@@ -96,7 +116,10 @@ def successes(row: dict) -> list[str]:
 def _aligned(rows: list[list[str]]) -> list[str]:
     widths = [max(map(len, column)) for column in zip(*rows)]
     # Words to the left, numbers to the right.
-    return ["  ".join(cell.ljust(w) if i < 2 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths))).rstrip() for row in rows]
+    return [
+        "  ".join(cell.ljust(w) if i < 2 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths))).rstrip()
+        for row in rows
+    ]
 
 
 def record(outcomes: Outcomes, settings: dict, model: Model) -> dict:
@@ -117,9 +140,12 @@ def record(outcomes: Outcomes, settings: dict, model: Model) -> dict:
 
 
 def _errors(outcome: Outcome) -> list[dict]:
-    several = zip(outcome.cases, outcome.distance, outcome.angle, *(outcome.ious[name] for name in OVERLAPS), strict=True)
+    several = zip(
+        outcome.cases, outcome.distance, outcome.angle, *(outcome.ious[name] for name in OVERLAPS), strict=True
+    )
     return [
-        {"object": case.instance, "position_cm": 100 * float(distance), "rotation_deg": float(angle)} | dict(zip(OVERLAPS, ious))
+        {"object": case.instance, "position_cm": 100 * float(distance), "rotation_deg": float(angle)}
+        | dict(zip(OVERLAPS, ious))
         for case, distance, angle, *ious in several
     ]
 

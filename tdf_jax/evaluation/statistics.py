@@ -72,10 +72,17 @@ def _by_symmetry(distance, angle, ious, cases, tilt) -> dict:
         chosen = folds == fold
         if not chosen.any():
             continue
-        known = {key: [iou for iou, kept in zip(several, chosen) if kept and iou is not None] for key, several in ious.items()}
-        parts[name] = {"cases": int(chosen.sum())} | {key: float(np.mean(several)) if several else None for key, several in known.items()}
+        known = {
+            key: [iou for iou, kept in zip(several, chosen) if kept and iou is not None]
+            for key, several in ious.items()
+        }
+        parts[name] = {"cases": int(chosen.sum())} | {
+            key: float(np.mean(several)) if several else None for key, several in known.items()
+        }
         for threshold, (metres, degrees) in THRESHOLDS.items():
-            parts[name][f"success_{threshold}"] = float(np.mean((distance[chosen] <= metres) & (angle[chosen] <= degrees)))
+            parts[name][f"success_{threshold}"] = float(
+                np.mean((distance[chosen] <= metres) & (angle[chosen] <= degrees))
+            )
         metres, degrees = THRESHOLDS["2cm_20deg"]
         upright = None if tilt is None else float(np.mean((distance[chosen] <= metres) & (tilt[chosen] <= degrees)))
         parts[name]["success_axis_2cm_20deg"] = upright

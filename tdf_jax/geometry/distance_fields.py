@@ -116,11 +116,15 @@ def box_obstacle(centre: ArrayLike, size: ArrayLike, rotation: ArrayLike | None 
     """
     centre, size = checked_vector("box_obstacle", "centre", centre), checked_vector("box_obstacle", "size", size)
     if not (size > 0).all():
-        raise InputError(f"box_obstacle(): size is {size.tolist()}; expected three lengths above 0, metres; give a sheet its thickness")
+        raise InputError(
+            f"box_obstacle(): size is {size.tolist()}; expected three lengths above 0, metres; give a sheet its thickness"
+        )
     R = np.asarray(np.eye(3) if rotation is None else rotation, dtype=float)
     if R.shape == (4,):
         if not (np.isfinite(R).all() and R.any()):
-            raise InputError(f"box_obstacle(): rotation wxyz is {R.tolist()}; expected a finite quaternion that is not zero")
+            raise InputError(
+                f"box_obstacle(): rotation wxyz is {R.tolist()}; expected a finite quaternion that is not zero"
+            )
         wxyz = R / np.linalg.norm(R)
     elif R.shape == (3, 3):
         check_rotations("box_obstacle", R)
@@ -153,10 +157,14 @@ def mesh_obstacle(mesh: "trimesh.Trimesh", pitch: float = 0.01, pad: float = 0.0
     """
     igl = libigl("mesh_obstacle()")
     if not (hasattr(mesh, "vertices") and hasattr(mesh, "faces")):
-        raise InputError(f"mesh_obstacle(): mesh is a {type(mesh).__name__}; expected a trimesh.Trimesh, such as tdf.load_mesh(path)")
+        raise InputError(
+            f"mesh_obstacle(): mesh is a {type(mesh).__name__}; expected a trimesh.Trimesh, such as tdf.load_mesh(path)"
+        )
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
     if len(faces) == 0 or not np.isfinite(vertices).all():
-        raise InputError(f"mesh_obstacle(): the mesh has {len(faces)} faces, or vertices that are not finite; expected a surface")
+        raise InputError(
+            f"mesh_obstacle(): the mesh has {len(faces)} faces, or vertices that are not finite; expected a surface"
+        )
 
     def signed(x):
         distance = np.sqrt(igl.point_mesh_squared_distance(x, vertices, faces)[0])
@@ -165,7 +173,9 @@ def mesh_obstacle(mesh: "trimesh.Trimesh", pitch: float = 0.01, pad: float = 0.0
     return tabulated("mesh_obstacle", vertices[faces].reshape(-1, 3), pitch, pad, signed)
 
 
-def cloud_obstacle(points: Float[Array, "points 3"], radius: float = 0.005, pitch: float = 0.005, pad: float = 0.05) -> DistanceGrid:
+def cloud_obstacle(
+    points: Float[Array, "points 3"], radius: float = 0.005, pitch: float = 0.005, pad: float = 0.05
+) -> DistanceGrid:
     """A cloud to keep clear of: a ball about each of its points, all of them counted however many there are.
 
     The space behind a seen surface is free, as far as a cloud tells. Between nodes the distance is at most 0.87 pitches
@@ -211,7 +221,9 @@ def grid_nodes(function: str, points: np.ndarray, pitch: float, pad: float) -> F
     return np.stack(np.meshgrid(*(low[i] + pitch * np.arange(counts[i]) for i in range(3)), indexing="ij"), axis=-1)
 
 
-def tabulated(function: str, points: np.ndarray, pitch: float, pad: float, signed: Callable[[np.ndarray], np.ndarray]) -> DistanceGrid:
+def tabulated(
+    function: str, points: np.ndarray, pitch: float, pad: float, signed: Callable[[np.ndarray], np.ndarray]
+) -> DistanceGrid:
     check_lengths(function, pitch, pad)
     x = grid_nodes(function, points, pitch, pad)
     values = signed(x.reshape(-1, 3)).reshape(x.shape[:3])

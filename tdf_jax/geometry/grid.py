@@ -48,10 +48,14 @@ class Grid:
         axes = tuple(np.asarray(steps, dtype=float) for steps in self.coordinates)
         for name, steps in zip("first second third".split(), axes):
             if steps.ndim != 1 or len(steps) < 2:
-                raise InputError(f"Grid(): the {name} axis has coordinates of shape {steps.shape}; expected at least two numbers")
+                raise InputError(
+                    f"Grid(): the {name} axis has coordinates of shape {steps.shape}; expected at least two numbers"
+                )
             step = (steps[-1] - steps[0]) / (len(steps) - 1)
             if not 0 < step < np.inf:
-                raise InputError(f"Grid(): the {name} axis goes from {steps[0]} to {steps[-1]}; expected it to increase")
+                raise InputError(
+                    f"Grid(): the {name} axis goes from {steps[0]} to {steps[-1]}; expected it to increase"
+                )
             if np.abs(steps - np.linspace(steps[0], steps[-1], len(steps))).max() > EVEN * np.abs(steps).max():
                 raise InputError(f"Grid(): the steps of the {name} axis differ; expected even ones, as of np.linspace")
         axes = tuple(np.linspace(steps[0], steps[-1], len(steps)) for steps in axes)
@@ -105,7 +109,9 @@ def plane_grid(
     steps = _symmetric("plane_grid", half, count)
     if isinstance(axes, str):
         if axes not in PLANES:
-            raise InputError(f"plane_grid(): axes is {axes!r}; expected one of {', '.join(PLANES)}, or two unit vectors")
+            raise InputError(
+                f"plane_grid(): axes is {axes!r}; expected one of {', '.join(PLANES)}, or two unit vectors"
+            )
         axes = np.eye(3)[["xyz".index(axis) for axis in axes]]
     if np.shape(axes) != (2, 3):
         raise InputError(f"plane_grid(): axes have shape {np.shape(axes)}; expected two vectors (2, 3)")
@@ -113,7 +119,10 @@ def plane_grid(
 
 
 def volume_grid(
-    half: float, count: int = 64, origin: Sequence[float] = (0.0, 0.0, 0.0), axes: Float[np.ndarray, "3 3"] | None = None
+    half: float,
+    count: int = 64,
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
+    axes: Float[np.ndarray, "3 3"] | None = None,
 ) -> Grid:
     """A cube.
 
@@ -132,7 +141,10 @@ def volume_grid(
 
 
 def path_grid(
-    path: Trajectory | Float[np.ndarray, "poses 3"], radius: float, step: float, axes: Float[np.ndarray, "3 3"] | None = None
+    path: Trajectory | Float[np.ndarray, "poses 3"],
+    radius: float,
+    step: float,
+    axes: Float[np.ndarray, "3 3"] | None = None,
 ) -> Grid:
     """The neighbourhood of a path: points of a lattice through its first corner that lie within a distance of it.
 
@@ -160,7 +172,9 @@ def path_grid(
     return dataclasses.replace(grid, mask=near.reshape(grid.shape))
 
 
-def distance_from_polyline(points: Float[np.ndarray, "points 3"], corners: Float[np.ndarray, "poses 3"]) -> Float[np.ndarray, " points"]:
+def distance_from_polyline(
+    points: Float[np.ndarray, "points 3"], corners: Float[np.ndarray, "poses 3"]
+) -> Float[np.ndarray, " points"]:
     """Distance of points from the nearest point of the polyline through some corners, metres."""
     points, corners = np.asarray(points, float), np.asarray(corners, float)
     least = np.linalg.norm(points - corners[0], axis=1)

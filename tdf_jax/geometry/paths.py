@@ -174,7 +174,12 @@ def tilt_and_pour(
         raise InputError(f"tilt_and_pour(): tilt is {tilt}; expected radians, less than pi.")
     turn = se3.exp(jnp.asarray(tilt * across / np.linalg.norm(across)))
     upright = start + lift + UPRIGHT * (end - start)
-    return _through("tilt_and_pour", poses, [start, start + lift, upright, end], [R_start, R_start, R_start, se3.multiply(turn, R_start)])
+    return _through(
+        "tilt_and_pour",
+        poses,
+        [start, start + lift, upright, end],
+        [R_start, R_start, R_start, se3.multiply(turn, R_start)],
+    )
 
 
 def hang_on_rack(
@@ -204,7 +209,9 @@ def hang_on_rack(
     approach = checked_vector("hang_on_rack", "approach", approach)
     front = end - approach
     if not (approach.any() and np.linalg.norm(front - start) > 0):
-        raise InputError(f"hang_on_rack(): approach is {approach.tolist()}; expected a vector that is not zero and not the whole way from start to end.")
+        raise InputError(
+            f"hang_on_rack(): approach is {approach.tolist()}; expected a vector that is not zero and not the whole way from start to end."
+        )
     if end_rotation is None:
         quarter = se3.exp(jnp.asarray(np.pi / 2 * approach / np.linalg.norm(approach)))
         R_end = se3.multiply(quarter, R_start)

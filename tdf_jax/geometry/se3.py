@@ -149,7 +149,9 @@ def rotation_grid(count: int) -> Float[np.ndarray, "count 3 3"]:
     return np.asarray(matrix_from_wxyz(wxyz))
 
 
-def turns(axis: Float[Array, "3"], count: int, start: Float[Array, "3 3"] | None = None) -> Float[np.ndarray, "count 3 3"]:
+def turns(
+    axis: Float[Array, "3"], count: int, start: Float[Array, "3 3"] | None = None
+) -> Float[np.ndarray, "count 3 3"]:
     """A slice of SO(3): an orientation turned about one axis in even steps, once around.
 
     Args:

@@ -162,9 +162,7 @@ def resample(trajectory: Trajectory, poses: int) -> Trajectory:
     return Trajectory(se3.pose(se3.geodesic(R[i], R[i + 1], fraction), translations))
 
 
-def displace(
-    trajectory: Trajectory, offset: Float[Array, "3"], where: Literal["start", "goal"] = "goal"
-) -> Trajectory:
+def displace(trajectory: Trajectory, offset: Float[Array, "3"], where: Literal["start", "goal"] = "goal") -> Trajectory:
     """The trajectory with one end moved; the other poses stay (the displacements of the paper's table 1).
 
     Args:

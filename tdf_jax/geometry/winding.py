@@ -43,7 +43,9 @@ def winding_number(mesh: "trimesh.Trimesh", x: Float[np.ndarray, "points 3"]) ->
         Barill, Dickson, Schmidt, Levin, Jacobson, Fast winding numbers for soups and clouds, SIGGRAPH 2018.
     """
     igl = libigl("winding_number()")
-    return igl.fast_winding_number(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64), np.asarray(x, float))
+    return igl.fast_winding_number(
+        np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64), np.asarray(x, float)
+    )
 
 
 def libigl(function: str):

@@ -49,7 +49,9 @@ def file_axes(up: str, front: str) -> Float[np.ndarray, "3 3"]:
             raise InputError(f"file_axes(): {name!r} is no axis; expected one of {', '.join(AXES)}")
     z, x = AXES[up], AXES[front]
     if z @ x:
-        raise InputError(f"file_axes(): up is {up} and front is {front}, which are parallel; expected two different axes")
+        raise InputError(
+            f"file_axes(): up is {up} and front is {front}, which are parallel; expected two different axes"
+        )
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 

@@ -83,14 +83,20 @@ def blank(
             "expected both from the same model"
         )
     if over_rotations not in OVER_ROTATIONS:
-        raise InputError(f"energy_landscape(): over_rotations is {over_rotations!r}; expected one of {', '.join(OVER_ROTATIONS)}")
+        raise InputError(
+            f"energy_landscape(): over_rotations is {over_rotations!r}; expected one of {', '.join(OVER_ROTATIONS)}"
+        )
     rotations = np.asarray(np.eye(3) if rotation is None else rotation, dtype=float)
     if rotations.shape[-2:] != (3, 3) or rotations.ndim not in (2, 3) or not len(rotations):
-        raise InputError(f"energy_landscape(): rotation has shape {rotations.shape}; expected (3, 3), or several (rotations, 3, 3)")
+        raise InputError(
+            f"energy_landscape(): rotation has shape {rotations.shape}; expected (3, 3), or several (rotations, 3, 3)"
+        )
     rotations = rotations.reshape(-1, 3, 3)
     square = np.allclose(rotations @ rotations.swapaxes(1, 2), np.eye(3), atol=ORTHOGONAL)
     if not square or (np.linalg.det(rotations) < 0).any():
-        raise InputError("energy_landscape(): rotation holds matrices that are no rotations; expected R R^T = I and no mirror image")
+        raise InputError(
+            "energy_landscape(): rotation holds matrices that are no rotations; expected R R^T = I and no mirror image"
+        )
     count = len(reference.descriptors)
     shape = (count, *(() if over_rotations == "best" else (len(rotations),)), *grid.shape)
     waypoints = np.asarray(reference.trajectory.translations + field.origin)
@@ -172,7 +178,9 @@ def query_change(
     chosen = places[rng.integers(len(places), size=samples)]
     points = jnp.asarray(grid.first + chosen @ (grid.steps[:, None] * grid.directions), field.origin.dtype)
     R = jnp.eye(3) if rotation is None else jnp.asarray(rotation)
-    before, after = (np.asarray(_at(field, one.descriptors, poses.rotate(R, one.query), points)) for one in (reference, changed))
+    before, after = (
+        np.asarray(_at(field, one.descriptors, poses.rotate(R, one.query), points)) for one in (reference, changed)
+    )
     apart = np.abs(after - before) / before
     return float(np.median(apart)), float(apart.max())
 

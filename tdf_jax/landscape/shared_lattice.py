@@ -127,7 +127,10 @@ def _tile_shape(shape, span):
         parts[-1] = LANES * math.ceil(parts[-1] / LANES)
         return parts
 
-    while math.prod(part + extra for part, extra in zip(size(), span)) > NODES and max(size()[:-1], default=1) + size()[-1] > 1 + LANES:
+    while (
+        math.prod(part + extra for part, extra in zip(size(), span)) > NODES
+        and max(size()[:-1], default=1) + size()[-1] > 1 + LANES
+    ):
         # The last axis is the vectors': it is cut only where it is twice as long as the others.
         lengths = [*size()[:-1], size()[-1] / 2 if size()[-1] > LANES else 0]
         pieces[int(np.argmax(lengths))] += 1
@@ -174,7 +177,11 @@ def swept(
     mesh = devices.alone() if mesh is None else mesh
     everywhere = NamedSharding(mesh, devices.split(mesh))
     workers = list(mesh.devices.flat)
-    own = [(index, jax.device_put(shared, worker)) for index, worker in enumerate(workers) if worker.process_index == jax.process_index()]
+    own = [
+        (index, jax.device_put(shared, worker))
+        for index, worker in enumerate(workers)
+        if worker.process_index == jax.process_index()
+    ]
     scale = descriptors.shape[1] * channels
     for start in range(0, len(which), len(workers)):
         some = which[start : start + len(workers)]
@@ -204,7 +211,9 @@ def _tile(field, references, axes, shifts, first, bases, size, span):
 
     def layer(sums, one):
         base, start, stop = one
-        descriptors = _descriptors(field, places.reshape(-1, 3) + base, blocks * unrolled).reshape(blocks, unrolled, *nodes)
+        descriptors = _descriptors(field, places.reshape(-1, 3) + base, blocks * unrolled).reshape(
+            blocks, unrolled, *nodes
+        )
 
         def block(sums, both):
             # Without the barrier the slice of this block is fused into the loop below, and taken again for every query

@@ -35,7 +35,9 @@ def lowest_cost_path(
             the sharpness is not in 0 to 50, or the points that count do not join both ends.
     """
     if landscape.turned is None:
-        raise InputError("lowest_cost_path(): the landscape keeps each rotation's energies; expected the best, or one rotation's")
+        raise InputError(
+            "lowest_cost_path(): the landscape keeps each rotation's energies; expected the best, or one rotation's"
+        )
     if not 0 <= sharpness <= SHARPEST:
         raise InputError(f"lowest_cost_path(): sharpness is {sharpness}; expected 0 to {SHARPEST:g}")
     grid, energy = landscape.grid, landscape.combined
@@ -48,7 +50,9 @@ def lowest_cost_path(
     path = [ends[1]]
     while path[-1] != ends[0]:
         if before[path[-1]] < 0:
-            raise InputError("lowest_cost_path(): the grid's points that count do not join start and goal; expected a grid with both in one piece")
+            raise InputError(
+                "lowest_cost_path(): the grid's points that count do not join start and goal; expected a grid with both in one piece"
+            )
         path.append(before[path[-1]])
     return points[path[::-1]]
 
@@ -59,7 +63,9 @@ def _nearest(name, grid, points, counts, end):
         raise InputError(f"lowest_cost_path(): {name} is {end.tolist()}; expected three finite numbers, metres")
     apart = np.where(counts.ravel(), np.linalg.norm(points - end, axis=1), np.inf)
     if apart.min() > np.linalg.norm(grid.steps):
-        raise InputError(f"lowest_cost_path(): {name} {end.tolist()} lies {apart.min():.3f} m from the grid's nearest point; expected it inside")
+        raise InputError(
+            f"lowest_cost_path(): {name} {end.tolist()} lies {apart.min():.3f} m from the grid's nearest point; expected it inside"
+        )
     return int(apart.argmin())
 
 

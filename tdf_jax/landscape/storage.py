@@ -116,7 +116,13 @@ def save_landscape(path: str | os.PathLike, landscape: Landscape, about: dict | 
     """
     path = _npz("save_landscape", path)
     grid = landscape.grid
-    header = {"format": FORMAT, "frame": FRAME, "unit": "metre", "reduce": landscape.reduce, "temperature": landscape.temperature}
+    header = {
+        "format": FORMAT,
+        "frame": FRAME,
+        "unit": "metre",
+        "reduce": landscape.reduce,
+        "temperature": landscape.temperature,
+    }
     arrays = {"values": landscape.values, "waypoints": landscape.waypoints, "rotations": landscape.rotations}
     arrays |= {"origin": grid.origin, "directions": grid.directions}
     arrays |= {f"coordinates_{axis}": steps for axis, steps in enumerate(grid.coordinates)}
@@ -144,18 +150,26 @@ def load_landscape(path: str | os.PathLike) -> tuple[Landscape, dict]:
             arrays = {name: file[name] for name in file.files}
         header = json.loads(str(arrays.pop("header")))
         if header["format"] != FORMAT:
-            raise InputError(f"load_landscape(): {path} has format {header['format']}; expected {FORMAT}: make it again")
+            raise InputError(
+                f"load_landscape(): {path} has format {header['format']}; expected {FORMAT}: make it again"
+            )
         axes = tuple(arrays[f"coordinates_{axis}"] for axis in range(len(arrays["directions"])))
         grid = Grid(arrays["origin"], arrays["directions"], axes, arrays.get("mask"))
         fields = {name: arrays[name] for name in ("values", "waypoints", "rotations")}
-        found = Landscape(grid, **fields, turned=arrays.get("turned"), reduce=header["reduce"], temperature=header["temperature"])
+        found = Landscape(
+            grid, **fields, turned=arrays.get("turned"), reduce=header["reduce"], temperature=header["temperature"]
+        )
         return found, header["about"]
     except FileNotFoundError:
-        raise InputError(f"load_landscape(): there is no file {path}; expected one from save_landscape or `tdf landscape`") from None
+        raise InputError(
+            f"load_landscape(): there is no file {path}; expected one from save_landscape or `tdf landscape`"
+        ) from None
     except InputError:
         raise
     except Exception as error:  # a damaged archive raises one of a dozen kinds
-        raise InputError(f"load_landscape(): cannot read {path} ({error}); expected a file from save_landscape") from None
+        raise InputError(
+            f"load_landscape(): cannot read {path} ({error}); expected a file from save_landscape"
+        ) from None
 
 
 def _npz(function, path):

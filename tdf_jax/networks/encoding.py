@@ -49,7 +49,9 @@ def encode(model: Model, points: Float[Array, "points 3"], thinnings: int = THIN
     if not isinstance(thinnings, int | np.integer) or thinnings < 0:
         raise InputError(f"encode(): thinnings is {thinnings}; expected a whole number of 0 or more")
     if len(points) < model.config.neighbours:
-        raise InputError(f"encode(): there are {len(points)} points; expected at least the network's {model.config.neighbours} neighbours")
+        raise InputError(
+            f"encode(): there are {len(points)} points; expected at least the network's {model.config.neighbours} neighbours"
+        )
     plain = not thinnings or count is None
     dense = not plain and len(points) > count
     traced = isinstance(points, jax.core.Tracer)
@@ -76,7 +78,9 @@ def _encode(params, config, clouds, several, size, tip):
     used = jnp.arange(clouds.shape[1]) < size
 
     def fill(index, state):
-        return jax.tree.map(lambda all, one: all.at[index].set(one), state, _latent(params, config, clouds[index], tip, used))
+        return jax.tree.map(
+            lambda all, one: all.at[index].set(one), state, _latent(params, config, clouds[index], tip, used)
+        )
 
     def add(index, sums):
         return jax.tree.map(lambda sum, all: sum + jnp.where(agreed[index], all[index], 0), sums, (latents, origins))

@@ -97,7 +97,9 @@ class ResidualBlock(nn.Module):
 
 
 @functools.partial(
-    jax.tree_util.register_dataclass, data_fields=["latent", "invariants", "into", "blocks", "out"], meta_fields=["config"]
+    jax.tree_util.register_dataclass,
+    data_fields=["latent", "invariants", "into", "blocks", "out"],
+    meta_fields=["config"],
 )
 @dataclasses.dataclass(frozen=True)
 class Conditioned:
@@ -163,7 +165,10 @@ class OccupancyNetwork(nn.Module):
         return self.decoder(self.encoder(points))
 
     def encode_latent(
-        self, points: Float[Array, "points 3"], used: Bool[Array, " points"] | None = None, tip: Float[Array, "3"] | None = None
+        self,
+        points: Float[Array, "points 3"],
+        used: Bool[Array, " points"] | None = None,
+        tip: Float[Array, "3"] | None = None,
     ) -> Float[Array, "latent 3"]:
         return self.encoder(points, used, tip)
 
@@ -255,7 +260,10 @@ class Encoder(nn.Module):
         self.fc_c = VectorLinear(hidden, config.latent)
 
     def __call__(
-        self, points: Float[Array, "points 3"], used: Bool[Array, " points"] | None = None, tip: Float[Array, "3"] | None = None
+        self,
+        points: Float[Array, "points 3"],
+        used: Bool[Array, " points"] | None = None,
+        tip: Float[Array, "3"] | None = None,
     ) -> Float[Array, "latent 3"]:
         if self.config.asymmetry:
             points = points - self.config.asymmetry * (farthest(points, used) if tip is None else tip)

@@ -48,7 +48,9 @@ def refine(model: Model, field: DescriptorField, points: Float[Array, "points 3"
     """
     points = check_points(points)
     if isinstance(points, jax.core.Tracer):
-        raise InputError("refine(): the points are traced by jax.jit; expected an array. Call refine() outside: it is compiled already")
+        raise InputError(
+            "refine(): the points are traced by jax.jit; expected an array. Call refine() outside: it is compiled already"
+        )
     points = np.asarray(points)
     if not isinstance(steps, int | np.integer) or isinstance(steps, bool) or steps < 0:
         raise InputError(f"refine(): steps is {steps!r}; expected a whole number of 0 or more")
@@ -57,7 +59,9 @@ def refine(model: Model, field: DescriptorField, points: Float[Array, "points 3"
     if len(points) > POINTS:
         points = points[np.random.default_rng(0).permutation(len(points))[:POINTS]]
     weights = (np.arange(POINTS) < len(points)).astype(points.dtype) / len(points)
-    conditioned = _refine(model.params, model.config, field.latent, np.resize(points, (POINTS, 3)) - field.origin, weights, steps)
+    conditioned = _refine(
+        model.params, model.config, field.latent, np.resize(points, (POINTS, 3)) - field.origin, weights, steps
+    )
     return DescriptorField(conditioned, field.origin)
 
 

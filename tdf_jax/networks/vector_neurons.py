@@ -105,7 +105,12 @@ class EdgeConvolution(nn.Module):
         # planes (points, neighbours)
         edge = map_planes(lambda a, x: a - x, tuple(jnp.moveaxis(neighbours, -1, 0)), spread)
         cross = _cross(edge, spread)
-        products = vector_dot(edge, edge), vector_dot(edge, spread), vector_dot(spread, spread), vector_dot(cross, cross)
+        products = (
+            vector_dot(edge, edge),
+            vector_dot(edge, spread),
+            vector_dot(spread, spread),
+            vector_dot(cross, cross),
+        )
         # Four terms written out, not a matrix product, which is not fused with what follows: 5 ms for 1500 points
         # instead of 16.
         inner, squared = (
@@ -173,7 +178,9 @@ class VectorResidualBlock(nn.Module):
         direction = _split_map(self.actvn_0.map_to_dir, x, pooled)
         shortcut = _split_map(self.shortcut.map_to_feat, x, pooled)
         if pooled is not None:
-            x = map_planes(lambda a, b: jnp.concatenate([a, jnp.broadcast_to(b, a.shape[:1] + b.shape[1:])], axis=-1), x, pooled)
+            x = map_planes(
+                lambda a, b: jnp.concatenate([a, jnp.broadcast_to(b, a.shape[:1] + b.shape[1:])], axis=-1), x, pooled
+            )
         hidden = self.fc_1(self.actvn_1(self.fc_0(_reflect(x, direction, self.slope))))
         return map_planes(jnp.add, shortcut, hidden)
 

@@ -73,9 +73,13 @@ def figure2(model: Model, base: Setting, field: str, count: int = 101) -> dict[s
     seen = encode(model, points)
     # The paths are relative to the clouds' centres, as in the losses: on another mug they lie where its centre takes
     # them.
-    paths = {name: np.asarray(reference.trajectory.translations + seen.origin) for name, reference in references.items()}
+    paths = {
+        name: np.asarray(reference.trajectory.translations + seen.origin) for name, reference in references.items()
+    }
     pick, orientation = paths["line"][0], references["line"].trajectory.rotations[0]
-    swept = energy_landscape(seen, _joined(list(references.values())), plane_grid(HALF * base.unit, count, pick), orientation)
+    swept = energy_landscape(
+        seen, _joined(list(references.values())), plane_grid(HALF * base.unit, count, pick), orientation
+    )
 
     def flat(x):
         return (np.asarray(x) - pick)[..., :2] / base.unit

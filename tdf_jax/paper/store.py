@@ -31,14 +31,20 @@ class Store:
 
     def run(self, setting: Setting) -> Run:
         """One imitation."""
-        return self._kept(["run", setting], lambda: dataclasses.asdict(imitation(self.model, setting)), lambda arrays: Run(**arrays))
+        return self._kept(
+            ["run", setting], lambda: dataclasses.asdict(imitation(self.model, setting)), lambda arrays: Run(**arrays)
+        )
 
     def landscapes(self, base: Setting, field: str, count: int) -> dict[str, Swept]:
         """Figure 2 of one field, see `tdf_jax.paper.energy_maps.figure2`."""
 
         def swept():
             panels = figure2(self.model, base, field, count)
-            return {f"{name}.{part}": value for name, panel in panels.items() for part, value in dataclasses.asdict(panel).items()}
+            return {
+                f"{name}.{part}": value
+                for name, panel in panels.items()
+                for part, value in dataclasses.asdict(panel).items()
+            }
 
         def panels(arrays):
             parts = [part.name for part in dataclasses.fields(Swept)]

@@ -104,7 +104,11 @@ class Row:
     def paper_loss(self) -> float | None:
         """The paper's final loss; None where it has no such row."""
         setting = self.setting
-        return PAPER.get((setting.trajectory, setting.displacement)) if self.group == TABLE and setting.displaced == "goal" else None
+        return (
+            PAPER.get((setting.trajectory, setting.displacement))
+            if self.group == TABLE and setting.displaced == "goal"
+            else None
+        )
 
     def mean(self, value: Callable[[Run], float]) -> float:
         """Mean over the seeds of a run's property."""
@@ -141,7 +145,9 @@ class Row:
         }
 
 
-def planned(base: Setting, seeds: int = SEEDS, variations: Sequence[str] = tuple(VARIATIONS)) -> list[tuple[str, list[Setting]]]:
+def planned(
+    base: Setting, seeds: int = SEEDS, variations: Sequence[str] = tuple(VARIATIONS)
+) -> list[tuple[str, list[Setting]]]:
     """What `rows` runs: (group, settings), one setting a seed.
 
     Args:
@@ -178,7 +184,9 @@ def as_csv(table: Sequence[Row]) -> str:
     for row in table:
         numbers = row.numbers()
         numbers["displacement"] = " ".join(f"{value:g}" for value in row.setting.displacement)
-        writer.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in numbers.items()})
+        writer.writerow(
+            {name: f"{value:.6g}" if isinstance(value, float) else value for name, value in numbers.items()}
+        )
     return text.getvalue()
 
 
@@ -200,7 +208,10 @@ def as_markdown(table: Sequence[Row]) -> str:
             f"| {n['waypoint_cm']:.1f} cm | {n['shape_cm']:.1f} cm |"
         )
     flips = sum(n["flips"] for n in own)
-    lines += ["", f"Means over {own[0]['seeds']} seeds, ± their standard deviation. Picks turned by more than 170°: {flips}."]
+    lines += [
+        "",
+        f"Means over {own[0]['seeds']} seeds, ± their standard deviation. Picks turned by more than 170°: {flips}.",
+    ]
     groups = [group for group in dict.fromkeys(row.group for row in table) if group != TABLE]
     if not groups:
         return "\n".join(lines) + "\n"

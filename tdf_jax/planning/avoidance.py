@@ -145,14 +145,21 @@ def push_clear(
 
     def required(at):
         """Of each obstacle, in the order of the groups, at lengths of the way."""
-        return np.minimum(margin, np.minimum(ends[0] + config.ramp * at[:, None], ends[1] + config.ramp * (way[-1] - at[:, None])))
+        return np.minimum(
+            margin, np.minimum(ends[0] + config.ramp * at[:, None], ends[1] + config.ramp * (way[-1] - at[:, None]))
+        )
 
     def excess(rows):
         at = np.interp(np.linspace(0, len(way) - 1, len(rows)), np.arange(len(way)), way)
         return rows - required(at)
 
     short = excess(rows)
-    deep = [(name, int(order[i]), ends[end, i]) for end, name in enumerate(("first", "last")) for i in range(len(order)) if ends[end, i] < -config.contact]
+    deep = [
+        (name, int(order[i]), ends[end, i])
+        for end, name in enumerate(("first", "last"))
+        for i in range(len(order))
+        if ends[end, i] < -config.contact
+    ]
     if short.min() >= -ROUNDING:
         return _said(trajectory, found, short, 0.0, deep, True)
     clear, rest = [], [(wxyz_xyz, found, short)]
@@ -165,7 +172,18 @@ def push_clear(
         points = spread
         for slack in SLACK:
             tried = np.resize(body[points], (POINTS, 3))  # one size, so that bodies of all sizes run one program
-            u, poses, cost = map(np.asarray, _push(groups, wxyz_xyz, tried, wanted + dtype.type(slack), u, numbers, np.asarray(config.iterations, dtype)))
+            u, poses, cost = map(
+                np.asarray,
+                _push(
+                    groups,
+                    wxyz_xyz,
+                    tried,
+                    wanted + dtype.type(slack),
+                    u,
+                    numbers,
+                    np.asarray(config.iterations, dtype),
+                ),
+            )
             missed = []
             for i in np.argsort(cost, kind="stable")[:BEST]:
                 moved = poses[i].copy()
@@ -198,7 +216,9 @@ def _said(trajectory, found, short, deviation, deep, kept):
     else:
         looks = found.between + 1
         row = int(short.min(axis=1).argmin())
-        where = f"at pose {row // looks}" if row % looks == 0 else f"between poses {row // looks} and {row // looks + 1}"
+        where = (
+            f"at pose {row // looks}" if row % looks == 0 else f"between poses {row // looks} and {row // looks + 1}"
+        )
         n = trajectory.poses
         remedy = "lower the margin, thin the body, or move an end or the obstacle"
         if short[::looks].min() >= -ROUNDING or n < 7:
@@ -270,8 +290,13 @@ def _push(groups, wxyz_xyz, body, wanted, starts, numbers, iterations):
         turns = jax.vmap(jax.jacfwd(se3.exp))(u[:, 3:] / lever)
         turns = exact("nijk,nlj->nilk", turns, se3.exp(u[:, 3:] / lever))
         twist = jnp.stack([turns[:, 2, 1], turns[:, 0, 2], turns[:, 1, 0]], axis=1) / lever
-        still, across = jnp.broadcast_to(jnp.eye(3, dtype=dtype), twist.shape), jnp.cross(turned[:, :, None], twist, axis=1)
-        frame = jnp.concatenate([jnp.concatenate([still, across], axis=2), jnp.concatenate([jnp.zeros_like(twist), twist], axis=2)], axis=1)
+        still, across = (
+            jnp.broadcast_to(jnp.eye(3, dtype=dtype), twist.shape),
+            jnp.cross(turned[:, :, None], twist, axis=1),
+        )
+        frame = jnp.concatenate(
+            [jnp.concatenate([still, across], axis=2), jnp.concatenate([jnp.zeros_like(twist), twist], axis=2)], axis=1
+        )
 
         def block(parts, a, b):
             return exact("c,scij,sik,sjl->skl", parts, squares, frame[a], frame[b])
@@ -281,7 +306,13 @@ def _push(groups, wxyz_xyz, body, wanted, starts, numbers, iterations):
 
         gradient = jnp.zeros((n, 6), dtype).at[i].add(pull(1 - f, i)).at[i + 1].add(pull(f, i + 1))
         aside = block(f * (1 - f), i, i + 1)
-        matrix = jnp.zeros((n, n, 6, 6), dtype).at[i, i].add(block((1 - f) ** 2, i, i)).at[i + 1, i + 1].add(block(f**2, i + 1, i + 1))
+        matrix = (
+            jnp.zeros((n, n, 6, 6), dtype)
+            .at[i, i]
+            .add(block((1 - f) ** 2, i, i))
+            .at[i + 1, i + 1]
+            .add(block(f**2, i + 1, i + 1))
+        )
         matrix = matrix.at[i, i + 1].add(aside).at[i + 1, i].add(jnp.swapaxes(aside, 1, 2))
         matrix = jnp.swapaxes(matrix[1:-1, 1:-1], 1, 2).reshape(6 * (n - 2), 6 * (n - 2))
         share = 1 / (segments * checks)
@@ -307,8 +338,14 @@ def _push(groups, wxyz_xyz, body, wanted, starts, numbers, iterations):
 
     def descend(u):
         size = 6 * (n - 2)
-        nothing = jnp.asarray(jnp.finfo(dtype).max / STIFF[1] / 4, dtype), jnp.zeros(size, dtype), jnp.zeros((size, size), dtype)
-        _, u, (value, _, _), _ = jax.lax.fori_loop(0, iterations.astype(int), step, (u, u, nothing, jnp.asarray(40.0, dtype)))
+        nothing = (
+            jnp.asarray(jnp.finfo(dtype).max / STIFF[1] / 4, dtype),
+            jnp.zeros(size, dtype),
+            jnp.zeros((size, size), dtype),
+        )
+        _, u, (value, _, _), _ = jax.lax.fori_loop(
+            0, iterations.astype(int), step, (u, u, nothing, jnp.asarray(40.0, dtype))
+        )
         R, t, _ = applied(u)
         return u, se3.pose(R, t), smooth(u) + STIFF[1] * value
 

@@ -71,7 +71,9 @@ def clearance(
     if between is None:
         between = motion_samples(wxyz_xyz, body, STEP) - 1
     elif not isinstance(between, int | np.integer) or isinstance(between, bool) or not 0 <= between <= MOST_BETWEEN:
-        raise InputError(f"clearance(): between is {between!r}; expected a whole number of 0 to {MOST_BETWEEN}, or None")
+        raise InputError(
+            f"clearance(): between is {between!r}; expected a whole number of 0 to {MOST_BETWEEN}, or None"
+        )
     return measure(wxyz_xyz, body, groups, order, int(between))[0]
 
 
@@ -79,29 +81,52 @@ def prepare(function, trajectory, body, obstacles):
     """Checked arrays of the trajectory's type; obstacles of a kind stacked, and where each of these was in the list."""
     wxyz_xyz = np.asarray(check_trajectory(trajectory).wxyz_xyz)
     body = np.asarray(body)
-    if body.ndim != 2 or body.shape[1] != 3 or not len(body) or body.dtype.kind not in "fiu" or not np.isfinite(body).all():
-        raise InputError(f"{function}(): body has shape {body.shape}; expected points (points, 3) of finite metres in the query frame")
+    if (
+        body.ndim != 2
+        or body.shape[1] != 3
+        or not len(body)
+        or body.dtype.kind not in "fiu"
+        or not np.isfinite(body).all()
+    ):
+        raise InputError(
+            f"{function}(): body has shape {body.shape}; expected points (points, 3) of finite metres in the query frame"
+        )
     if not isinstance(obstacles, list | tuple) or not obstacles:
-        raise InputError(f"{function}(): obstacles are {obstacles!r}; expected a list of at least one, such as [box_obstacle(...)]")
+        raise InputError(
+            f"{function}(): obstacles are {obstacles!r}; expected a list of at least one, such as [box_obstacle(...)]"
+        )
     kinds: dict[Any, list[int]] = {}
     arrays = []
     for i, obstacle in enumerate(obstacles):
         leaves, tree = jax.tree.flatten(obstacle)
-        if not callable(getattr(obstacle, "distance", None)) or not leaves or not all(isinstance(leaf, jax.Array | np.ndarray) for leaf in leaves):
+        if (
+            not callable(getattr(obstacle, "distance", None))
+            or not leaves
+            or not all(isinstance(leaf, jax.Array | np.ndarray) for leaf in leaves)
+        ):
             raise InputError(
                 f"{function}(): obstacles[{i}] is a {type(obstacle).__name__}; expected an obstacle of tdf_jax.obstacles, "
                 "or a registered dataclass of arrays with a method distance"
             )
-        arrays.append([np.asarray(leaf, wxyz_xyz.dtype if jnp.issubdtype(leaf.dtype, jnp.floating) else None) for leaf in leaves])
+        arrays.append(
+            [np.asarray(leaf, wxyz_xyz.dtype if jnp.issubdtype(leaf.dtype, jnp.floating) else None) for leaf in leaves]
+        )
         kinds.setdefault((tree, *((leaf.shape, leaf.dtype) for leaf in leaves)), []).append(i)
-    groups = [jax.tree.unflatten(kind[0], [np.stack(parts) for parts in zip(*(arrays[i] for i in which))]) for kind, which in kinds.items()]
+    groups = [
+        jax.tree.unflatten(kind[0], [np.stack(parts) for parts in zip(*(arrays[i] for i in which))])
+        for kind, which in kinds.items()
+    ]
     return wxyz_xyz, body.astype(wxyz_xyz.dtype), groups, np.concatenate([np.array(which) for which in kinds.values()])
 
 
 def body_centres(wxyz_xyz, body):
     """The middle of the body at each pose, in numpy: op by op, jax would compile each."""
     w, v, middle = wxyz_xyz[:, :1].astype(float), wxyz_xyz[:, 1:4].astype(float), body.mean(axis=0, dtype=float)
-    return middle + 2 * np.cross(v, np.cross(v, middle) + w * middle) / (w**2 + np.sum(v**2, axis=1, keepdims=True)) + wxyz_xyz[:, 4:]
+    return (
+        middle
+        + 2 * np.cross(v, np.cross(v, middle) + w * middle) / (w**2 + np.sum(v**2, axis=1, keepdims=True))
+        + wxyz_xyz[:, 4:]
+    )
 
 
 def _turns(wxyz_xyz):

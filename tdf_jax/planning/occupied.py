@@ -25,7 +25,9 @@ FIELD_BLOCK = 8192  # points of a field evaluated in one call: one size, so that
 FIELD_REACH = 0.015
 
 
-def field_obstacle(field: DescriptorField, points: Float[Array, "points 3"], pitch: float = 0.003, pad: float = 0.03) -> DistanceGrid:
+def field_obstacle(
+    field: DescriptorField, points: Float[Array, "points 3"], pitch: float = 0.003, pad: float = 0.03
+) -> DistanceGrid:
     """The object itself to keep clear of, as its field knows it: the surface is where the occupancy is a half.
 
     The field tells hidden sides too, which the cloud does not. Refine it first (`refine`): this is what that is for.

@@ -115,11 +115,17 @@ def build_bottle(parameters: BottleParameters = BottleParameters()) -> Bottle:
     _check(parameters)
     mesh = moulded(_clay(parameters))
     if not is_one_body(mesh, handles=int(parameters.handle)):
-        raise InputError(f"build_bottle(): the dimensions give no single closed bottle; got {parameters}; expected the neck and handle of a common "
-                         "bottle: move them towards the defaults")
+        raise InputError(
+            f"build_bottle(): the dimensions give no single closed bottle; got {parameters}; expected the neck and handle of a common "
+            "bottle: move them towards the defaults"
+        )
     half, p = parameters.height / 2, parameters
     neck = (_neck_from(p) + p.height) / 2
-    places = {"neck": frame(0.0, neck - half), "base": frame(0.0, -half), "body": frame(0.0, p.shoulder_bottom / 2 - half)}
+    places = {
+        "neck": frame(0.0, neck - half),
+        "base": frame(0.0, -half),
+        "body": frame(0.0, p.shoulder_bottom / 2 - half),
+    }
     return Bottle(mesh, parameters, places)
 
 
@@ -184,21 +190,32 @@ def _check(p: BottleParameters) -> None:
             raise InputError(f"build_bottle(): {what}; got {p}")
 
     need(p.shoulder_style in SHOULDERS, f"shoulder_style is {p.shoulder_style!r}; expected one of {SHOULDERS}")
-    check_numbers("build_bottle", p, may_be_zero=("edge_radius", "cap_height", "mouth_depth"), may_be_negative=("bulge",))
+    check_numbers(
+        "build_bottle", p, may_be_zero=("edge_radius", "cap_height", "mouth_depth"), may_be_negative=("bulge",)
+    )
     need(0.35 <= p.aspect <= 1, f"aspect is {p.aspect}; expected 0.35 to 1")
     need(2 <= p.squareness <= 20, f"squareness is {p.squareness}; expected 2 (round) to 20 (square)")
     need(1 <= p.shoulder_curve <= 4, f"shoulder_curve is {p.shoulder_curve}; expected 1 to 4")
     need(0.5 <= p.neck_taper <= 1.1, f"neck_taper is {p.neck_taper}; expected 0.5 to 1.1")
     need(0.3 <= p.cap_taper <= 1.1, f"cap_taper is {p.cap_taper}; expected 0.3 to 1.1")
-    need(p.edge_radius < p.shoulder_bottom < p.shoulder_top < p.height, "expected edge_radius, shoulder_bottom, shoulder_top and height to rise in this order")
+    need(
+        p.edge_radius < p.shoulder_bottom < p.shoulder_top < p.height,
+        "expected edge_radius, shoulder_bottom, shoulder_top and height to rise in this order",
+    )
     need(p.cap_height <= 0.98 * (p.height - p.shoulder_top), "cap_height must be less than the neck's")
-    need(p.cap_height == 0 or p.cap_height > _LEAST_CAP * p.height, f"cap_height must be 0 or more than {_LEAST_CAP} of height")
+    need(
+        p.cap_height == 0 or p.cap_height > _LEAST_CAP * p.height,
+        f"cap_height must be 0 or more than {_LEAST_CAP} of height",
+    )
     need(abs(p.bulge) < 0.3 * p.radius, "bulge must be less than 0.3 of radius")
     need(p.edge_radius < 0.9 * p.radius * p.aspect, "edge_radius must be less than 0.9 of the smaller radius")
     need(p.neck_radius <= 0.9 * p.radius * p.aspect, "neck_radius must be less than 0.9 of the body's smaller radius")
     widest = max(_neck(p, p.height - p.cap_height), _neck(p, p.height))
     need(p.cap_height == 0 or p.cap_radius >= widest, "cap_radius must be at least that of the neck within the cap")
-    need(p.cap_height > 0 or p.mouth_depth < 0.9 * (p.height - p.shoulder_bottom), "mouth_depth must be less than the height of neck and shoulder")
+    need(
+        p.cap_height > 0 or p.mouth_depth < 0.9 * (p.height - p.shoulder_bottom),
+        "mouth_depth must be less than the height of neck and shoulder",
+    )
     if p.handle:
         _check_handle(p, need)
 
@@ -206,13 +223,22 @@ def _check(p: BottleParameters) -> None:
 def _check_handle(p: BottleParameters, need) -> None:
     half = p.height / 2
     body, tube = _clay(p).joined
-    need(p.handle_top - p.handle_bottom > 3 * p.handle_thickness, "handle_top and handle_bottom are too close for the thickness")
+    need(
+        p.handle_top - p.handle_bottom > 3 * p.handle_thickness,
+        "handle_top and handle_bottom are too close for the thickness",
+    )
     ends = tube_rings(tube)[[0, -1]].reshape(-1, 3)
-    need(encloses(body, ends).all(), "the handle does not end inside the bottle: move its attachments to the body or the neck")
+    need(
+        encloses(body, ends).all(),
+        "the handle does not end inside the bottle: move its attachments to the body or the neck",
+    )
     need(bends_freely(tube), "the handle bends more tightly than its thickness allows: thin it or move it out")
     need(p.handle_bottom > p.edge_radius + p.handle_thickness, "handle_bottom is below the body: raise it")
     gap = tube.line[:, 0] - p.handle_thickness / 2 - np.array([_wall(p, level) for level in tube.line[:, 1] + half])
-    need(np.abs(np.diff((gap > 0.02 * p.height).astype(int))).sum() == 2, "the handle leaves no finger hole: raise handle_reach")
+    need(
+        np.abs(np.diff((gap > 0.02 * p.height).astype(int))).sum() == 2,
+        "the handle leaves no finger hole: raise handle_reach",
+    )
 
 
 def _shoulder(p: BottleParameters, share):
@@ -246,13 +272,23 @@ def _wall(p: BottleParameters, level: float) -> float:
 def _neck_from(p: BottleParameters) -> float:
     """Level where the shoulder is half way from the body's radius to the neck's."""
     share = np.linspace(0, 1, 401)
-    return float(p.shoulder_bottom + (p.shoulder_top - p.shoulder_bottom) * share[np.argmax(_shoulder(p, share) <= 0.5)])
+    return float(
+        p.shoulder_bottom + (p.shoulder_top - p.shoulder_bottom) * share[np.argmax(_shoulder(p, share) <= 0.5)]
+    )
 
 
 def _outline(p: BottleParameters) -> Loft:
     unit = section(p.aspect, p.squareness)
     quarter = 1 - np.cos(np.linspace(0, np.pi / 2, 6))
-    levels = np.unique(np.round(np.concatenate([p.edge_radius * quarter, np.linspace(p.edge_radius, p.shoulder_bottom, 12)]) / p.height, 9)) * p.height
+    levels = (
+        np.unique(
+            np.round(
+                np.concatenate([p.edge_radius * quarter, np.linspace(p.edge_radius, p.shoulder_bottom, 12)]) / p.height,
+                9,
+            )
+        )
+        * p.height
+    )
     body = (_body(p, levels) - inset(levels, p.edge_radius))[:, None] * unit
     # Small steps towards the top of a dome, where it is flat.
     share = np.sin(np.linspace(0, np.pi / 2, 25))[1:] if p.shoulder_style == "arc" else np.linspace(0, 1, 25)[1:]

@@ -89,8 +89,10 @@ def build_bowl(parameters: BowlParameters = BowlParameters()) -> Bowl:
     _check(parameters)
     mesh = moulded(_clay(parameters))
     if not is_one_body(mesh, handles=0):
-        raise InputError(f"build_bowl(): the dimensions give no single closed bowl; got {parameters}; expected the walls of a common bowl: "
-                         "move them towards the defaults")
+        raise InputError(
+            f"build_bowl(): the dimensions give no single closed bowl; got {parameters}; expected the walls of a common bowl: "
+            "move them towards the defaults"
+        )
     half, p = parameters.height / 2, parameters
     rim = float(_outer(p)[0][-1] + _inner_radius(p, np.array([p.height]))[0]) / 2
     return Bowl(mesh, parameters, {"rim": frame(rim, half), "base": frame(0.0, -half), "body": frame(0.0, 0.0)})
@@ -149,10 +151,16 @@ def _check(p: BowlParameters) -> None:
     need(2 * p.lip_radius < p.wall_thickness, "lip_radius must be less than half of wall_thickness")
     need(p.base_radius < 0.95 * p.radius, "base_radius must be less than 0.95 of radius")
     need(abs(p.rim_flare) < 0.25 * p.radius, "rim_flare must be less than a quarter of radius")
-    need(p.radius + min(p.rim_flare, 0) > p.base_radius + p.wall_thickness, "base_radius leaves no room for the wall: lower it")
+    need(
+        p.radius + min(p.rim_flare, 0) > p.base_radius + p.wall_thickness,
+        "base_radius leaves no room for the wall: lower it",
+    )
     need(p.foot_height + p.bottom_thickness + p.lip_radius < 0.6 * p.height, "the bottom is too thick for the height")
     need(p.foot_height == 0 or p.foot_width < 0.8 * p.base_radius, "foot_width leaves no recess: lower it")
-    need(p.wall_thickness < 0.25 * p.radius * p.aspect, "wall_thickness must be less than a quarter of the smaller radius")
+    need(
+        p.wall_thickness < 0.25 * p.radius * p.aspect,
+        "wall_thickness must be less than a quarter of the smaller radius",
+    )
 
 
 def _outer(p: BowlParameters) -> tuple[np.ndarray, np.ndarray]:
@@ -185,7 +193,16 @@ def _clay(p: BowlParameters) -> Clay:
     lip = p.height - p.lip_radius * quarter
     levels = np.unique(np.round(np.concatenate([[0.0], height, lip]) / p.height, 9)) * p.height
     outer = np.interp(levels, height, radius) - inset(p.height - levels, p.lip_radius)
-    levels_in = np.unique(np.round(np.concatenate([floor + (p.height - floor) * (1 - np.cos(np.linspace(0, np.pi / 2, _PROFILE))), lip]) / p.height, 9)) * p.height
+    levels_in = (
+        np.unique(
+            np.round(
+                np.concatenate([floor + (p.height - floor) * (1 - np.cos(np.linspace(0, np.pi / 2, _PROFILE))), lip])
+                / p.height,
+                9,
+            )
+        )
+        * p.height
+    )
     inner = _inner_radius(p, levels_in) + inset(p.height - levels_in, p.lip_radius)
     above = np.append(levels_in, 1.5 * p.height)  # cut well past the rim, so no two faces coincide
     hollows = [Loft(above - p.height / 2, np.append(inner, inner[-1])[:, None] * unit)]

@@ -116,7 +116,12 @@ class Mug(Shape):
         wide = np.array([0.0, p.handle_width / 2, 0.0])
         levels = np.linspace(0, p.height, _LANDMARKS_UP)
         around = polygon(p.squareness, _LANDMARKS_AROUND)
-        wall = np.concatenate([np.column_stack([r * around, np.full(len(around), z)]) for r, z in zip(_wall(p, levels), levels - p.height / 2)])
+        wall = np.concatenate(
+            [
+                np.column_stack([r * around, np.full(len(around), z)])
+                for r, z in zip(_wall(p, levels), levels - p.height / 2)
+            ]
+        )
         return np.concatenate([middle + thick, middle - thick, middle + wide, middle - wide, wall])
 
 
@@ -136,12 +141,16 @@ def build_mug(parameters: MugParameters = MugParameters()) -> Mug:
     clay = _clay(parameters)
     mesh = moulded(clay)
     if not is_one_body(mesh, handles=1):
-        raise InputError(f"build_mug(): the dimensions give no single closed cup with one handle; got {parameters}; "
-                         "expected walls and handle of a common mug: move them towards the defaults")
+        raise InputError(
+            f"build_mug(): the dimensions give no single closed cup with one handle; got {parameters}; "
+            "expected walls and handle of a common mug: move them towards the defaults"
+        )
     grip = _grip(clay.joined[1], parameters)
     rim = parameters.top_radius - parameters.wall_thickness / 2
     half = parameters.height / 2
-    return Mug(mesh, parameters, {"handle": frame(grip[0], grip[1]), "rim": frame(-rim, half, -1.0), "base": frame(0.0, -half)})
+    return Mug(
+        mesh, parameters, {"handle": frame(grip[0], grip[1]), "rim": frame(-rim, half, -1.0), "base": frame(0.0, -half)}
+    )
 
 
 def sample_mug(rng: np.random.Generator) -> MugParameters:
@@ -212,8 +221,10 @@ def _check(parameters: MugParameters) -> None:
     need(np.min(_wall(p, levels)) > p.wall_thickness, "wall_thickness must be less than the radius at every height")
     need(p.edge_radius < 0.9 * p.bottom_radius, "edge_radius must be less than 0.9 of bottom_radius")
     need(_wall(p, floor) > p.wall_thickness + _inner_edge(p), "the cavity closes at its floor: thin the wall")
-    need(p.foot_height == 0 or p.edge_radius + p.foot_width < 0.95 * p.bottom_radius,
-         "foot_width leaves no recess: lower it or edge_radius")
+    need(
+        p.foot_height == 0 or p.edge_radius + p.foot_width < 0.95 * p.bottom_radius,
+        "foot_width leaves no recess: lower it or edge_radius",
+    )
     size = p.handle_thickness * p.handle_flare
     need(p.handle_top + size / 2 < p.height - p.lip_radius, "handle_top is above the body: lower it")
     need(p.handle_bottom - size / 2 > 0, "handle_bottom is below the body: raise it")

@@ -81,7 +81,9 @@ class Shape(ABC):
         if points.ndim != 2 or points.shape[1] != 3:
             raise InputError(f"{name}.contains(): points have shape {points.shape}; expected (points, 3)")
         if not np.isfinite(points).all():
-            raise InputError(f"{name}.contains(): points hold NaN or infinite numbers; expected finite metres; remove them")
+            raise InputError(
+                f"{name}.contains(): points hold NaN or infinite numbers; expected finite metres; remove them"
+            )
         clay = np.any([encloses(part, points) for part in self.clay.joined], axis=0)
         for hollow in self.clay.hollows:
             clay &= ~encloses(hollow, points)
@@ -120,7 +122,9 @@ def scaled(shape: Shape, factor: float) -> Shape:
     if not (np.isfinite(factor) and factor > 0):
         raise InputError(f"scaled(): factor is {factor}; expected a positive number")
     lengths = [field.name for field in dataclasses.fields(shape.parameters) if field.name not in shape.unitless]
-    parameters = dataclasses.replace(shape.parameters, **{name: getattr(shape.parameters, name) * factor for name in lengths})
+    parameters = dataclasses.replace(
+        shape.parameters, **{name: getattr(shape.parameters, name) * factor for name in lengths}
+    )
     grow = np.ones((4, 4))
     grow[:3, 3] = factor
     frames = {name: frame * grow for name, frame in shape.frames.items()}

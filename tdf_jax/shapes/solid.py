@@ -166,7 +166,9 @@ def bar_line(x_top: float, x_bottom: float, x_bar: float, top: float, bottom: fl
     """A handle's centre line (points, 2) in the x-z plane: a level arm out to an upright bar, round corners, and an arm back."""
     turn, middle = np.linspace(0, np.pi / 2, 40), (top + bottom) / 2
     x, z = x_bar - radius * (1 - np.sin(turn)), top - radius * (1 - np.cos(turn))
-    return np.concatenate([[[x_top, top]], np.stack([x, z], 1), np.stack([x, 2 * middle - z], 1)[::-1], [[x_bottom, bottom]]])
+    return np.concatenate(
+        [[[x_top, top]], np.stack([x, z], 1), np.stack([x, 2 * middle - z], 1)[::-1], [[x_bottom, bottom]]]
+    )
 
 
 def swept(line: np.ndarray, thickness: float, width: float, squareness: float, flare: float, count: int) -> Tube:
@@ -207,7 +209,11 @@ def skin(rings: np.ndarray) -> "trimesh.Trimesh":
     here = np.arange(count * corners).reshape(count, corners)
     there = np.roll(here, -1, axis=1)
     first, last = np.full(corners, count * corners), np.full(corners, count * corners + 1)
-    triangles = [(here[:-1], there[:-1], there[1:]), (here[:-1], there[1:], here[1:]),
-                 (there[0], here[0], first), (here[-1], there[-1], last)]
+    triangles = [
+        (here[:-1], there[:-1], there[1:]),
+        (here[:-1], there[1:], here[1:]),
+        (there[0], here[0], first),
+        (here[-1], there[-1], last),
+    ]
     faces = np.concatenate([np.stack(corner, axis=-1).reshape(-1, 3) for corner in triangles])
     return trimesh.Trimesh(np.concatenate([rings.reshape(-1, 3), rings[[0, -1]].mean(axis=1)]), faces, process=False)

@@ -154,7 +154,9 @@ def _run(state, starts, field, reference, energy, rates, steps, *, fix_last, chu
     if mesh is not None:
         split, whole = devices.split(mesh), devices.WHOLE
         states = split, optax.ScaleByAdamState(whole, split, split), whole
-        work = jax.shard_map(work, mesh=mesh, in_specs=(states, split, *[whole] * 5), out_specs=(states, split), check_vma=False)
+        work = jax.shard_map(
+            work, mesh=mesh, in_specs=(states, split, *[whole] * 5), out_specs=(states, split), check_vma=False
+        )
     return work(state, starts, field, reference, energy, rates, steps)
 
 
@@ -223,9 +225,7 @@ def _evaluator(starts, field, reference, energy, fix_last, chunk):
         losses, gradient = jax.lax.map(indexed, inputs, batch_size=chunk if chunk > 1 else None)
         remaining, remaining_gradient = jax.vmap(jax.value_and_grad(rest))(variables, start_rotations)
         mask = (jnp.arange(n) < free)[:, None]
-        gradient = jax.tree.map(
-            lambda a, b: unflat(a) + jnp.where(mask, b, 0.0), gradient, remaining_gradient
-        )
+        gradient = jax.tree.map(lambda a, b: unflat(a) + jnp.where(mask, b, 0.0), gradient, remaining_gradient)
         return (losses.reshape(inits, free).sum(axis=1) + fixed) / n + remaining, gradient
 
     return evaluate

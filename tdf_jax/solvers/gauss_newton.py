@@ -99,7 +99,9 @@ def descend(R, place, waypoint, bounds, damping, tolerance, field, problem, ener
     work = functools.partial(_steps, length=length, chunk=chunk, axes=mesh.axis_names if mesh is not None else ())
     if mesh is not None:
         split = devices.split(mesh)
-        work = jax.shard_map(work, mesh=mesh, in_specs=(*[split] * 3, *[devices.WHOLE] * 6), out_specs=split, check_vma=False)
+        work = jax.shard_map(
+            work, mesh=mesh, in_specs=(*[split] * 3, *[devices.WHOLE] * 6), out_specs=split, check_vma=False
+        )
     return work(R, place, waypoint, bounds, damping, tolerance, field, problem, energy)
 
 
@@ -129,7 +131,11 @@ def _steps(R, place, waypoint, bounds, damping, tolerance, field, problem, energ
         return i + 1, state, damping, jnp.where(moves[:, None], step, 0.0), hopeful, history
 
     count, dtype = len(R), R.dtype
-    values = jnp.full(count, jnp.inf, dtype), jnp.zeros((count, 6), dtype), jnp.broadcast_to(jnp.eye(6, dtype=dtype), (count, 6, 6))
+    values = (
+        jnp.full(count, jnp.inf, dtype),
+        jnp.zeros((count, 6), dtype),
+        jnp.broadcast_to(jnp.eye(6, dtype=dtype), (count, 6, 6)),
+    )
     begin = _State(R, place, *values), jnp.full(count, damping, dtype), jnp.zeros((count, 6), dtype)
     carry = (jnp.int32(0), *begin, jnp.bool_(True), jnp.zeros((count, length), dtype))
     _, state, _, _, _, history = jax.lax.while_loop(lambda carry: (carry[0] <= steps) & carry[4], body, carry)
@@ -171,11 +177,15 @@ def _evaluate(R, place, waypoint, bounds, field, problem, energy, chunk):
         R_, place_, waypoint_ = (jax.lax.dynamic_slice_in_dim(part, begin, count) for part in (R, place, waypoint))
 
         def block(b, total):
-            terms = _match(R_, place_, field, problem.query[b], problem.weights[b] / used, problem.descriptors[waypoint_, b])
+            terms = _match(
+                R_, place_, field, problem.query[b], problem.weights[b] / used, problem.descriptors[waypoint_, b]
+            )
             return jax.tree.map(jnp.add, total, terms)
 
         total = jax.lax.fori_loop(0, blocks, block, tuple(jnp.zeros_like(part[:count]) for part in values))
-        return jax.tree.map(lambda whole, part: jax.lax.dynamic_update_slice_in_dim(whole, part, begin, 0), values, total)
+        return jax.tree.map(
+            lambda whole, part: jax.lax.dynamic_update_slice_in_dim(whole, part, begin, 0), values, total
+        )
 
     values = tuple(jnp.zeros((len(R), *shape), R.dtype) for shape in ((), (6,), (6, 6)))
     values = jax.lax.fori_loop(0, (last + count - 1) // count, some, values)

@@ -41,7 +41,9 @@ def prepare(
         InputError: as for `optimize`.
     """
     if not isinstance(energy, EnergyWeights):
-        raise InputError(f"{function}: energy is {energy!r}; expected EnergyWeights, such as EnergyWeights(correlation=0.02)")
+        raise InputError(
+            f"{function}: energy is {energy!r}; expected EnergyWeights, such as EnergyWeights(correlation=0.02)"
+        )
     devices.check_mesh(function, mesh)
     if fix_last and reference.trajectory.poses == 1:
         raise InputError(f"{function}: the trajectory has one pose and fix_last keeps it; expected fix_last=False")

@@ -71,9 +71,17 @@ class SolveConfig:
     def __post_init__(self):
         for name in ("inits", "scouts", "points", "finalists", "chunk"):
             if not _counts(getattr(self, name)) and (name, getattr(self, name)) != ("chunk", None):
-                raise InputError(f"SolveConfig(): {name} is {getattr(self, name)!r}; expected a whole number of at least 1")
-        if not isinstance(self.steps, tuple) or len(self.steps) != len(FIRST_DAMPINGS) or not all(map(_counts, self.steps)):
-            raise InputError(f"SolveConfig(): steps is {self.steps!r}; expected a tuple of six whole numbers of at least 1")
+                raise InputError(
+                    f"SolveConfig(): {name} is {getattr(self, name)!r}; expected a whole number of at least 1"
+                )
+        if (
+            not isinstance(self.steps, tuple)
+            or len(self.steps) != len(FIRST_DAMPINGS)
+            or not all(map(_counts, self.steps))
+        ):
+            raise InputError(
+                f"SolveConfig(): steps is {self.steps!r}; expected a tuple of six whole numbers of at least 1"
+            )
         if not 0 < self.start_radius < np.inf:
             raise InputError(f"SolveConfig(): start_radius is {self.start_radius}; expected a positive number")
         if not 0 <= self.tolerance < 1:
@@ -146,14 +154,18 @@ def solve(
     n = starts.shape[1]
     free = n - 1 if fix_last else n
     if not (starts[:, free:] == starts[:1, free:]).all():
-        raise InputError("solve(): the last poses of the starts differ and fix_last keeps them; expected one, or a goal")
+        raise InputError(
+            "solve(): the last poses of the starts differ and fix_last keeps them; expected one, or a goal"
+        )
 
     problem = _problem(key, reference, min(config.points, len(reference.query)))
     # Together: a program for each would be 0.15 s more to compile.
     together = _candidates(np.concatenate([starts.reshape(-1, 7), problem.target]), problem)
     drawn = Candidates(*(part[:-n].reshape(len(starts), n, *part.shape[1:]) for part in together[:2]))
     shown = Candidates(*(part[-n:] for part in together[:2]))
-    scouts, inits, kept = (len(starts),) * 2 + (config.finalists,) if given else (config.scouts, config.inits, config.finalists)
+    scouts, inits, kept = (
+        (len(starts),) * 2 + (config.finalists,) if given else (config.scouts, config.inits, config.finalists)
+    )
     room = max(scouts, max(inits, free + kept + 1) * free + 1)
     shared, parts = (field, problem, energy), 1
     if mesh is not None:
@@ -168,7 +180,9 @@ def solve(
 
     def curve(found, *others):
         """Energies of the best candidates of each waypoint during a stage, among them others that stand still, (times, kept)."""
-        rows = np.concatenate([found.history, *(np.broadcast_to(other, (len(found.history), *other.shape)) for other in others)], axis=1)
+        rows = np.concatenate(
+            [found.history, *(np.broadcast_to(other, (len(found.history), *other.shape)) for other in others)], axis=1
+        )
         return np.sort(rows, axis=1)[:, np.minimum(np.arange(kept), rows.shape[1] - 1)].sum(axis=2)
 
     keyframe = int(np.linalg.norm(shown.place[:free], axis=1).argmin())
@@ -279,7 +293,9 @@ def _run(stage, candidates, fixed=None, waypoints=None, *, shared, config, room,
         limits = devices.placed(limits, mesh)
     chunk = config.chunk or devices.points_at_a_time(CHUNK_POINTS)
     results = descent.descend(*given, *limits, *shared, length=max(config.steps) + 1, chunk=chunk, mesh=mesh)
-    R, place, values = (devices.gathered(part)[np.argsort(dealt)] if mesh is not None else np.asarray(part) for part in results)
+    R, place, values = (
+        devices.gathered(part)[np.argsort(dealt)] if mesh is not None else np.asarray(part) for part in results
+    )
     history = values.T[: config.steps[stage] + 1]
     history = np.where(np.isfinite(history), history, np.inf)
     ended = [part[: rows * free].reshape(rows, free, *part.shape[1:]) for part in (R, place)]

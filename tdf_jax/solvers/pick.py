@@ -53,7 +53,9 @@ class CarryConfig:
 
     def __post_init__(self):
         if not isinstance(self.steps, tuple) or len(self.steps) != 4:
-            raise InputError(f"CarryConfig(): steps is {self.steps!r}; expected a tuple of four whole numbers of at least 1")
+            raise InputError(
+                f"CarryConfig(): steps is {self.steps!r}; expected a tuple of four whole numbers of at least 1"
+            )
         try:
             self.solver
         except InputError as error:
@@ -63,7 +65,10 @@ class CarryConfig:
     def solver(self) -> SolveConfig:
         """The solver's settings: of one waypoint it makes no search of whole trajectories, and carries none."""
         scout, halve, refine, polish = self.steps
-        settings = {name: getattr(self, name) for name in ("scouts", "finalists", "points", "tolerance", "start", "start_radius", "chunk")}
+        settings = {
+            name: getattr(self, name)
+            for name in ("scouts", "finalists", "points", "tolerance", "start", "start_radius", "chunk")
+        }
         return SolveConfig(inits=1, steps=(scout, halve, 1, 1, refine, polish), **settings)
 
 
@@ -108,7 +113,18 @@ def carry(
         check_goal("carry()", goal)
         goal = jnp.asarray(goal)
     picked = Reference(reference.descriptors[:1], Trajectory(reference.trajectory.wxyz_xyz[:1]), reference.query)
-    result = solve(field, picked, key, fix_last=False, energy=EnergyWeights(0.0), config=config.solver, progress=progress, mesh=mesh)
-    trajectories, starts = (carry_to_picks(reference.trajectory, part[:, 0], goal) for part in (result.trajectories, result.starts))
+    result = solve(
+        field,
+        picked,
+        key,
+        fix_last=False,
+        energy=EnergyWeights(0.0),
+        config=config.solver,
+        progress=progress,
+        mesh=mesh,
+    )
+    trajectories, starts = (
+        carry_to_picks(reference.trajectory, part[:, 0], goal) for part in (result.trajectories, result.starts)
+    )
     left = pick_residual(result.loss, picked.descriptors[0]) if result.finite.any() else float("nan")
     return dataclasses.replace(result, trajectories=trajectories, starts=starts, residual=left)

@@ -12,7 +12,9 @@ from tdf_jax.geometry.trajectory import Trajectory
 
 
 @functools.partial(
-    jax.tree_util.register_dataclass, data_fields=["trajectories", "losses", "energies", "starts", "residual", "confidence", "recognised"], meta_fields=[]
+    jax.tree_util.register_dataclass,
+    data_fields=["trajectories", "losses", "energies", "starts", "residual", "confidence", "recognised"],
+    meta_fields=[],
 )
 @dataclasses.dataclass(frozen=True)
 class Result:

@@ -72,7 +72,14 @@ class Batch:
 
 
 def draw(
-    data: DataSet, rng: np.random.Generator, pairs: int, points: int, queries: int, corruption: float, box: int, poses: int
+    data: DataSet,
+    rng: np.random.Generator,
+    pairs: int,
+    points: int,
+    queries: int,
+    corruption: float,
+    box: int,
+    poses: int,
 ) -> Batch:
     """Draw one batch.
 
@@ -144,7 +151,9 @@ def validation_pairs(data: DataSet, points: int, box: int, poses: int, one_view:
         surface = surface[data.visible[index, 0]] if one_view else surface
         samples.append(_sample(data, index, thin(surface, points), queries, VALIDATION_DIAGONAL))
     rng = np.random.default_rng(0)
-    pairs = [_pair(rng, pair, VALIDATION_DIAGONAL, box, poses) for pair in zip(samples[::2], samples[1::2], strict=True)]
+    pairs = [
+        _pair(rng, pair, VALIDATION_DIAGONAL, box, poses) for pair in zip(samples[::2], samples[1::2], strict=True)
+    ]
     return [Batch(*(np.asarray(field, np.float32) for field in pair)) for pair in pairs]
 
 
@@ -181,7 +190,10 @@ def _pair(rng, samples, diagonal, box, poses):
         right = b.places[place] @ T_place_query
         wrong = [_unlike(rng, right, diagonal, x, b) for _ in range(poses - 1)]
         offered.append([_apply(T, x) for T in (*_equals(right, b), *wrong)])
-    fields = (np.stack([getattr(sample, name) for sample in samples]) for name in ("cloud", "queries", "inside", "centre", "fold"))
+    fields = (
+        np.stack([getattr(sample, name) for sample in samples])
+        for name in ("cloud", "queries", "inside", "centre", "fold")
+    )
     return *fields, shown, offered
 
 
@@ -189,7 +201,10 @@ def _equals(right, target):
     """The right pose after each quarter turn about the target's axis; turns that its symmetry does not allow are replaced by none."""
     T_mean_object = np.eye(4)
     T_mean_object[:3, 3] = target.centre
-    turned = [T_mean_object @ about_z(quarter * np.pi / 2) @ np.linalg.inv(T_mean_object) @ right for quarter in range(QUARTERS)]
+    turned = [
+        T_mean_object @ about_z(quarter * np.pi / 2) @ np.linalg.inv(T_mean_object) @ right
+        for quarter in range(QUARTERS)
+    ]
     return [turned[quarter if quarter * target.fold % QUARTERS == 0 else 0] for quarter in range(QUARTERS)]
 
 

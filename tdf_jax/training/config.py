@@ -43,7 +43,12 @@ class TrainConfig:
     network: NetworkConfig = NetworkConfig()
 
     def __post_init__(self):
-        least = dict.fromkeys(("queries", "box", "validate_every"), 1) | {"batch": 2, "poses": 2, "seed": 0, "warmup": 0}
+        least = dict.fromkeys(("queries", "box", "validate_every"), 1) | {
+            "batch": 2,
+            "poses": 2,
+            "seed": 0,
+            "warmup": 0,
+        }
         least |= {"steps": self.warmup + 1, "points": self.network.neighbours + 1}
         for name, low in least.items():
             if getattr(self, name) < low:

@@ -79,7 +79,9 @@ class Recipe:
         if self.meshes is None and self.fold != 1:
             raise InputError("Recipe(): fold is for meshes; generated objects know theirs; drop it")
         if self.validation % 2:
-            raise InputError(f"Recipe(): validation is {self.validation}; expected an even number, objects come in pairs")
+            raise InputError(
+                f"Recipe(): validation is {self.validation}; expected an even number, objects come in pairs"
+            )
         if not 0 < self.unit < np.inf:
             raise InputError(f"Recipe(): unit is {self.unit}; expected metres per unit of the files, such as 0.001")
         if not 0 <= self.stretch <= 1:
@@ -153,13 +155,18 @@ def build(recipe: Recipe, directory: str | Path, workers: int = 1, progress: boo
     """
     directory = Path(directory)
     splits = _mesh_files(recipe)
-    manifest = {"recipe": dataclasses.asdict(recipe), "files": {name: [file.name for file in files] for name, files in splits.items()}}
+    manifest = {
+        "recipe": dataclasses.asdict(recipe),
+        "files": {name: [file.name for file in files] for name, files in splits.items()},
+    }
     if not _claimed(directory, manifest):
         _check_meshes(recipe, [file for files in splits.values() for file in files], progress)
         try:
             directory.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"tdf dataset: cannot make the folder {directory} ({error}); expected a writable place") from None
+            raise InputError(
+                f"tdf dataset: cannot make the folder {directory} ({error}); expected a writable place"
+            ) from None
         replace_file("tdf dataset", directory / MANIFEST, json.dumps(manifest, indent=1).encode())
     missing = [shard for shard in _shards(recipe) if not (directory / shard[0]).exists()]
     tasks = [(recipe, splits[split], split, index) for _, split, indices in missing for index in indices]
@@ -188,7 +195,9 @@ def load(directory: str | Path) -> tuple[DataSet, DataSet]:
     parts = {split: [] for split in SPLITS}
     for name, split, indices in _shards(recipe):
         if not (directory / name).exists():
-            raise InputError(f"load(): {directory} has no {name}; the data set is not finished: run its tdf dataset command again")
+            raise InputError(
+                f"load(): {directory} has no {name}; the data set is not finished: run its tdf dataset command again"
+            )
         parts[split].append(_read(directory / name, lambda file, count=len(indices): _unpacked(file, recipe, count)))
     return tuple(_collected(parts[split]) for split in SPLITS)
 
@@ -290,12 +299,16 @@ def _check_meshes(recipe, files, progress):
     diagonals, problems = {}, []
     for file in tqdm(files, desc="checking meshes", disable=not progress):
         try:
-            diagonals[file.name] = float(np.linalg.norm(canonical_mesh(file, recipe.unit, recipe.up, recipe.front).extents))
+            diagonals[file.name] = float(
+                np.linalg.norm(canonical_mesh(file, recipe.unit, recipe.up, recipe.front).extents)
+            )
         except InputError as error:
             problems.append(str(error))
     if problems:
         listed = "\n  ".join(problems)
-        raise InputError(f"tdf dataset: {len(problems)} of {len(files)} meshes will not do; mend them or take them out:\n  {listed}")
+        raise InputError(
+            f"tdf dataset: {len(problems)} of {len(files)} meshes will not do; mend them or take them out:\n  {listed}"
+        )
     small, large = min(diagonals, key=diagonals.get), max(diagonals, key=diagonals.get)
     if diagonals[large] > UNIT_SPREAD * diagonals[small]:
         raise InputError(

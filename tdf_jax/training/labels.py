@@ -53,7 +53,13 @@ def generated_object(category: str, rng: np.random.Generator, points: int, queri
 
 
 def scanned_object(
-    mesh: "trimesh.Trimesh", rng: np.random.Generator, points: int, queries: int, cameras: int, stretch: float, fold: int = 1
+    mesh: "trimesh.Trimesh",
+    rng: np.random.Generator,
+    points: int,
+    queries: int,
+    cameras: int,
+    stretch: float,
+    fold: int = 1,
 ) -> Labelled:
     """A user's mesh, watertight or not, labelled by the generalised winding number.
 
@@ -111,7 +117,11 @@ def canonical_mesh(path, unit: float, up: str, front: str) -> "trimesh.Trimesh":
     x = np.random.default_rng(0).uniform(mesh.bounds[0] - pad, mesh.bounds[1] + pad, (4000, 3))
     enclosed = inside(mesh, x)
     if enclosed is None or enclosed.mean() < LEAST_INSIDE:
-        got = "is open: much of its bounding box is neither inside nor outside" if enclosed is None else "encloses next to nothing"
+        got = (
+            "is open: much of its bounding box is neither inside nor outside"
+            if enclosed is None
+            else "encloses next to nothing"
+        )
         raise InputError(
             f"canonical_mesh(): {path} {got}; expected a closed surface, or one with small holes, of a solid with walls: "
             "give it thickness, or leave it out"

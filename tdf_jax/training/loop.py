@@ -92,7 +92,9 @@ def train(
     with drawn_ahead(batch, data, start, workers) as batches, (directory / METRICS).open("a") as metrics:
         bar = tqdm(range(start, config.steps), initial=start, total=config.steps, desc="training", disable=not progress)
         for step in bar:
-            params, state, parts = _step(params, state, dataclasses.astuple(next(batches)), step, config.network, optimiser)
+            params, state, parts = _step(
+                params, state, dataclasses.astuple(next(batches)), step, config.network, optimiser
+            )
             row = {"step": step + 1, "seconds": round(time.monotonic() - began, 2)} | summary(parts)
             bar.set_postfix({name: f"{row[name]:.3f}" for name in ("bce", "frame", "place", "iou")})
             done = step + 1 == config.steps
@@ -102,7 +104,9 @@ def train(
             metrics.write(json.dumps(row) + "\n")
             metrics.flush()
             if not np.isfinite(row["loss"]):
-                raise FloatingPointError(f"train(): the loss is {row['loss']} at step {step + 1}; lower the learning rate")
+                raise FloatingPointError(
+                    f"train(): the loss is {row['loss']} at step {step + 1}; lower the learning rate"
+                )
             if done or time.monotonic() - saved > config.save_seconds:
                 save(directory, params, state, step + 1)
                 saved = time.monotonic()
@@ -149,7 +153,9 @@ def _transfers(validation: DataSet) -> list[Transfer]:
             (VALIDATION_DIAGONAL * validation.surface[one], _at_size(validation.places[one, 0])) for one in pair
         )
         moved = (points_b @ T_world_b[:3, :3].T + T_world_b[:3, 3]).astype(np.float32)
-        transfers.append(Transfer(points_a, moved, place_a, T_world_b @ place_b, T_world_b, int(validation.fold[pair[1]]), scale=1.0))
+        transfers.append(
+            Transfer(points_a, moved, place_a, T_world_b @ place_b, T_world_b, int(validation.fold[pair[1]]), scale=1.0)
+        )
     return transfers
 
 
@@ -265,7 +271,9 @@ def _read_outs(latents, centres, fold, seed):
 
 def _any_front(latents, seed):
     """A read-out (latent,) of vectors about 1 long: from zeros, none of a symmetric object's fronts would ever be nearer than another."""
-    return np.random.default_rng([seed, 3]).normal(size=latents.shape[1]) / np.sqrt(np.mean(np.sum(latents**2, axis=(1, 2))))
+    return np.random.default_rng([seed, 3]).normal(size=latents.shape[1]) / np.sqrt(
+        np.mean(np.sum(latents**2, axis=(1, 2)))
+    )
 
 
 def _fitted(latents, truths):

@@ -46,7 +46,9 @@ def pair_loss(
     Returns:
         The loss, and its parts by name, one of each object.
     """
-    fields, losses, parts = _each(functools.partial(_object_loss, params, config), clouds, queries, inside, centres, fold)
+    fields, losses, parts = _each(
+        functools.partial(_object_loss, params, config), clouds, queries, inside, centres, fold
+    )
     others = jax.tree.map(lambda leaf: leaf[::-1], fields)
     place = _each(place_error, fields, others, shown, offered)
     return jnp.mean(losses) + PLACE_WEIGHT * jnp.mean(place), parts | {"place": place}
@@ -99,7 +101,9 @@ def frame_error(
     turns = jnp.arange(QUARTERS)
     fronts = jnp.round(jnp.stack([jnp.cos(turns * jnp.pi / 2), jnp.sin(turns * jnp.pi / 2), 0 * turns], axis=1))
     misses = jnp.where(turns * fold % QUARTERS == 0, jnp.sum((front - fronts) ** 2, axis=1), jnp.inf)
-    return jnp.sum((up - jnp.asarray(UP)) ** 2) + jnp.where(fold > 0, jnp.min(misses), 0) + jnp.sum((origin - centre) ** 2)
+    return (
+        jnp.sum((up - jnp.asarray(UP)) ** 2) + jnp.where(fold > 0, jnp.min(misses), 0) + jnp.sum((origin - centre) ** 2)
+    )
 
 
 def place_error(

@@ -29,7 +29,9 @@ _draw = None  # of a drawing process
 
 
 @contextlib.contextmanager
-def drawn_ahead(draw: Callable[[DataSet, int], Batch], data: DataSet, start: int, workers: int) -> Iterator[Iterator[Batch]]:
+def drawn_ahead(
+    draw: Callable[[DataSet, int], Batch], data: DataSet, start: int, workers: int
+) -> Iterator[Iterator[Batch]]:
     """The batches of the steps from `start` on, in order; a step's batch does not depend on who draws it.
 
     Args:
@@ -53,7 +55,9 @@ def drawn_ahead(draw: Callable[[DataSet, int], Batch], data: DataSet, start: int
             for field in dataclasses.fields(data):
                 np.save(folder / f"{field.name}.npy", getattr(data, field.name))
             # Started afresh, for a forked copy of a process that runs JAX may hang.
-            pool = concurrent.futures.ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _open, (folder, draw))
+            pool = concurrent.futures.ProcessPoolExecutor(
+                workers, multiprocessing.get_context("spawn"), _open, (folder, draw)
+            )
             ask = functools.partial(pool.submit, _drawn)
         stack.callback(pool.shutdown, cancel_futures=True)
         yield _in_order(ask, start, asked_ahead(workers))
@@ -82,7 +86,10 @@ def _open(folder, draw):
     global _draw
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process of the terminal: the run answers it
     threading.Thread(target=_end_with_the_run, args=(folder,), daemon=True).start()
-    columns = {field.name: np.asarray(np.load(folder / f"{field.name}.npy", mmap_mode="r")) for field in dataclasses.fields(DataSet)}
+    columns = {
+        field.name: np.asarray(np.load(folder / f"{field.name}.npy", mmap_mode="r"))
+        for field in dataclasses.fields(DataSet)
+    }
     _draw = functools.partial(draw, DataSet(**columns))
 
 

@@ -53,7 +53,9 @@ def restore(directory: Path, params, state) -> tuple:
     saved = jax.tree.map(jnp.asarray, _read(path, lambda content: serialization.from_bytes(target, content)))
     shapes = [[leaf.shape for leaf in jax.tree.leaves(tree)] for tree in (target["params"], saved["params"])]
     if shapes[0] != shapes[1]:
-        raise InputError(f"train(): {path} is a checkpoint of another network; expected one of these settings. Choose another directory.")
+        raise InputError(
+            f"train(): {path} is a checkpoint of another network; expected one of these settings. Choose another directory."
+        )
     return saved["params"], saved["state"], int(saved["step"])
 
 
@@ -82,4 +84,6 @@ def _read(path, parse):
         return parse(path.read_bytes())
     except Exception as error:  # damaged files raise whatever their parser stumbles on
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"train(): {path} cannot be read ({reason}): damaged, or of another version; delete the folder, or restore the file") from None
+        raise InputError(
+            f"train(): {path} cannot be read ({reason}): damaged, or of another version; delete the folder, or restore the file"
+        ) from None

@@ -61,7 +61,14 @@ def bins(predicted: Float[np.ndarray, " picks"], right: Float[np.ndarray, " pick
         rate = float(right[chosen].mean())
         middle, half = rate + z**2 / (2 * n), z * np.sqrt(rate * (1 - rate) / n + z**2 / (4 * n**2))
         low, high = ((middle + sign * half) / (1 + z**2 / n) for sign in (-1, 1))
-        rows.append({"picks": n, "predicted": float(predicted[chosen].mean()), "right": rate, "interval": [float(min(low, rate)), float(max(high, rate))]})
+        rows.append(
+            {
+                "picks": n,
+                "predicted": float(predicted[chosen].mean()),
+                "right": rate,
+                "interval": [float(min(low, rate)), float(max(high, rate))],
+            }
+        )
     return rows
 
 
@@ -79,7 +86,9 @@ def ranking(predicted: Float[np.ndarray, " picks"], right: Float[np.ndarray, " p
     return float(np.mean((good[:, None] > bad) + 0.5 * (good[:, None] == bad)))
 
 
-def logistic(features: Float[np.ndarray, "cases features"], right: Float[np.ndarray, " cases"]) -> Float[np.ndarray, "1+features"]:
+def logistic(
+    features: Float[np.ndarray, "cases features"], right: Float[np.ndarray, " cases"]
+) -> Float[np.ndarray, "1+features"]:
     """Intercept and slopes of the logistic curve of maximal likelihood, by Newton's method.
 
     Args:
@@ -91,7 +100,9 @@ def logistic(features: Float[np.ndarray, "cases features"], right: Float[np.ndar
     for _ in range(100):
         p = 1 / (1 + np.exp(-x @ weights))
         # A faint pull to zero keeps it finite where right and wrong do not overlap.
-        step = np.linalg.solve(x.T @ (x * (p * (1 - p))[:, None]) + 1e-3 * np.eye(len(weights)), x.T @ (right - p) - 1e-3 * weights)
+        step = np.linalg.solve(
+            x.T @ (x * (p * (1 - p))[:, None]) + 1e-3 * np.eye(len(weights)), x.T @ (right - p) - 1e-3 * weights
+        )
         weights += step
         if np.abs(step).max() < 1e-9:
             break
@@ -172,7 +183,9 @@ def recognition(
         InputError: the curve is not three finite numbers.
     """
     if np.shape(curve) != (3,) or not np.isfinite(curve).all():
-        raise InputError(f"recognition(): curve is {curve!r}; expected three finite numbers, such as those of tdf_jax.uncertainty.calibration.CURVES")
+        raise InputError(
+            f"recognition(): curve is {curve!r}; expected three finite numbers, such as those of tdf_jax.uncertainty.calibration.CURVES"
+        )
     if not np.isfinite([residual, surface_logit]).all():
         return None
     exponent = np.dot(curve, (1.0, -np.log(max(residual, 1e-9)), surface_logit))

@@ -38,7 +38,9 @@ _AXES = np.eye(6)
 
 
 # Plus and minus of each: six axes, then the sums and the differences of their 15 pairs, all of length 1.
-_STEPS = np.concatenate([_AXES, (_AXES[_FIRST] + _AXES[_SECOND]) / np.sqrt(2), (_AXES[_FIRST] - _AXES[_SECOND]) / np.sqrt(2)])
+_STEPS = np.concatenate(
+    [_AXES, (_AXES[_FIRST] + _AXES[_SECOND]) / np.sqrt(2), (_AXES[_FIRST] - _AXES[_SECOND]) / np.sqrt(2)]
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -96,14 +98,19 @@ class PoseCovariance:
         """
         values = np.asarray(self.values)
         if values.ndim != 1:
-            raise InputError(f"PoseCovariance.free: there is a batch of shape {values.shape[:-1]}; expected one pose. Take one by jax.tree.map(lambda part: part[i], ...)")
+            raise InputError(
+                f"PoseCovariance.free: there is a batch of shape {values.shape[:-1]}; expected one pose. Take one by jax.tree.map(lambda part: part[i], ...)"
+            )
         bound = max(FREE * values[-1], float(_least_value(self.scale, self.lever)))
         return np.asarray(self.directions)[values <= bound]
 
     @property
     def screws(self) -> list[Screw]:
         """The free twists as motions about axes: an object of revolution's is a turn about its axis, pitch 0."""
-        return [_screw(twist.astype(np.float64), np.asarray(self.centre, np.float64), float(self.lever)) for twist in self.free]
+        return [
+            _screw(twist.astype(np.float64), np.asarray(self.centre, np.float64), float(self.lever))
+            for twist in self.free
+        ]
 
 
 def pose_covariance(
@@ -152,13 +159,19 @@ def _check(function, reference, pose, waypoint, scale):
         raise InputError(f"{function}: pose has shape {pose.shape}; expected (7,), wxyz_xyz. For several use jax.vmap")
     count = len(reference.descriptors)
     if not isinstance(waypoint, int | np.integer) or isinstance(waypoint, bool) or not -count <= waypoint < count:
-        raise InputError(f"{function}: waypoint is {waypoint!r}; expected a whole number below the reference's {count} waypoints")
+        raise InputError(
+            f"{function}: waypoint is {waypoint!r}; expected a whole number below the reference's {count} waypoints"
+        )
     if not isinstance(pose, jax.core.Tracer) and not (np.isfinite(pose).all() and np.linalg.norm(pose[:4]) > 1e-6):
-        raise InputError(f"{function}: pose is {np.asarray(pose).tolist()}; expected finite numbers, w x y z of a rotation first")
+        raise InputError(
+            f"{function}: pose is {np.asarray(pose).tolist()}; expected finite numbers, w x y z of a rotation first"
+        )
     if not isinstance(scale, jax.core.Tracer) and not (np.ndim(scale) == 0 and 0 < scale < np.inf):
         raise InputError(f"{function}: scale is {scale}; expected an energy above 0, such as {SCALE}")
     if not isinstance(reference.query, jax.core.Tracer) and not np.ptp(reference.query, axis=0).any():
-        raise InputError(f"{function}: all query points are at one place, where turns change nothing; expected several, such as tdf.box_query(key, count=500)")
+        raise InputError(
+            f"{function}: all query points are at one place, where turns change nothing; expected several, such as tdf.box_query(key, count=500)"
+        )
 
 
 @jax.jit

@@ -36,7 +36,11 @@ class Mode:
 
 
 def cluster_poses(
-    wxyz_xyz: Float[Array, "inits 7"], energies: Float[Array, " inits"], *, angle: float = SAME_ANGLE, distance: float = SAME_DISTANCE
+    wxyz_xyz: Float[Array, "inits 7"],
+    energies: Float[Array, " inits"],
+    *,
+    angle: float = SAME_ANGLE,
+    distance: float = SAME_DISTANCE,
 ) -> list[Mode]:
     """The distinct poses among those that several starts came to.
 
@@ -77,7 +81,9 @@ def cluster_poses(
     wxyz, xyz = wxyz_xyz[:, :4].astype(np.float64), wxyz_xyz[:, 4:].astype(np.float64)
     lengths = np.linalg.norm(wxyz[finite], axis=1)
     if not (lengths > 1e-6).all():
-        raise InputError(f"cluster_poses(): the quaternion of start {finite[np.argmin(lengths)]} has length {lengths.min():.1e}; expected w x y z of a rotation, length 1")
+        raise InputError(
+            f"cluster_poses(): the quaternion of start {finite[np.argmin(lengths)]} has length {lengths.min():.1e}; expected w x y z of a rotation, length 1"
+        )
     wxyz[finite] /= lengths[:, None]
 
     left, modes = finite[np.argsort(energies[finite], kind="stable")], []
@@ -86,7 +92,9 @@ def cluster_poses(
         # q and -q are one rotation; the chord between unit quaternions is 2 sin(angle / 4), which is exact for small
         # angles as an arc cosine is not.
         chords = np.minimum(*(np.linalg.norm(wxyz[left] + sign * wxyz[best], axis=1) for sign in (-1, 1)))
-        near = (4 * np.arcsin(np.minimum(chords / 2, 1)) <= angle) & (np.linalg.norm(xyz[left] - xyz[best], axis=1) <= distance)
+        near = (4 * np.arcsin(np.minimum(chords / 2, 1)) <= angle) & (
+            np.linalg.norm(xyz[left] - xyz[best], axis=1) <= distance
+        )
         members, left = left[near], left[~near]
         modes.append(Mode(wxyz_xyz[best], float(energies[best]), members, len(members) / len(finite)))
     return modes

@@ -21,7 +21,11 @@ def truth_figure(tasks: Sequence[Task]) -> Figure:
     for task in tasks:
         mesh = task.case.object_b.mesh.copy().apply_transform(task.case.T_world_b)
         view = View(task.case.points_b, triangles_of(mesh), task.expected, None, task.demonstration.trajectory)
-        moved = "" if task.displacement == "none" else f", goal {'opposite' if task.displacement == 'opposite' else 'moved by ' + task.displacement}"
+        moved = (
+            ""
+            if task.displacement == "none"
+            else f", goal {'opposite' if task.displacement == 'opposite' else 'moved by ' + task.displacement}"
+        )
         views.append((task.path.replace("_", " ") + moved, view))
     return panels(views, 3, bounds(np.asarray(tasks[0].demonstration.query)), tasks[0].expected.poses, share=0.78)
 
@@ -37,12 +41,24 @@ def errors_figure(scores: Sequence[Score], bold: str) -> Figure:
     with matplotlib.rc_context(STYLE):
         figure = blank_figure(WIDTH, 4.2, layout="constrained")
         both = figure.subplots(1, 2, sharey=True)
-        for axes, name, error in zip(both, ("pick", "path"), (lambda one: one.distances[0], lambda one: one.path_error)):
+        for axes, name, error in zip(
+            both, ("pick", "path"), (lambda one: one.distances[0], lambda one: one.path_error)
+        ):
             for index, (method, several) in enumerate(groups.items()):
                 values = np.sort([CENTIMETRES * error(one) for one in several])
                 shares = np.arange(1, len(values) + 1) / len(values)
-                style = {"color": TRUTH, "lw": 2.2, "zorder": 5} if method == bold else {"color": COLOURS(index / len(groups)), "lw": 1.1, "ls": LINES[index % len(LINES)]}
-                axes.step(np.concatenate([[0], values, [FARTHEST]]), np.concatenate([[0], shares, shares[-1:]]), where="post", label=method, **style)
+                style = (
+                    {"color": TRUTH, "lw": 2.2, "zorder": 5}
+                    if method == bold
+                    else {"color": COLOURS(index / len(groups)), "lw": 1.1, "ls": LINES[index % len(LINES)]}
+                )
+                axes.step(
+                    np.concatenate([[0], values, [FARTHEST]]),
+                    np.concatenate([[0], shares, shares[-1:]]),
+                    where="post",
+                    label=method,
+                    **style,
+                )
             axes.set(xlabel=f"{name} error (cm)", xscale="symlog", xlim=(0, FARTHEST), ylim=(0, 1.01))
             axes.set_xticks([0, 0.5, 1, 2, 5, 10, 20], ["0", "0.5", "1", "2", "5", "10", "20"])
             axes.minorticks_off()
@@ -70,10 +86,26 @@ def reliability_figure(scores: Sequence[Score], bins: Sequence[Mapping]) -> Figu
         means = np.array([one["predicted"] for one in bins])
         rates = np.array([one["right"] for one in bins])
         limits = np.array([one["interval"] for one in bins])
-        axes.errorbar(means, rates, np.abs(limits.T - rates), color=INK, fmt="o", ms=4, lw=1, capsize=2, label="picks, 95 % interval")
+        axes.errorbar(
+            means,
+            rates,
+            np.abs(limits.T - rates),
+            color=INK,
+            fmt="o",
+            ms=4,
+            lw=1,
+            capsize=2,
+            label="picks, 95 % interval",
+        )
         axes.set(ylabel="share within 2 cm and 20°", ylim=(-0.02, 1.04), xlim=(-0.02, 1.02))
         axes.legend(frameon=False, loc="lower right")
-        counts.hist([predicted[right], predicted[~right]], bins=20, range=(0, 1), color=[COLOURS(0.6), TRUTH], label=["right", "wrong"])
+        counts.hist(
+            [predicted[right], predicted[~right]],
+            bins=20,
+            range=(0, 1),
+            color=[COLOURS(0.6), TRUTH],
+            label=["right", "wrong"],
+        )
         counts.set(xlabel="confidence", ylabel="picks", yscale="log", ylim=(0.7, None))
         counts.yaxis.set_major_formatter("{x:g}")
         counts.minorticks_off()
@@ -97,11 +129,21 @@ def demonstrations_figure(found: Sequence[Mapping]) -> Figure:
         for condition in clouds:
             first = [one for one in found if one["clouds"] == condition and one["count"] == 1]
             for way in ways:
-                rows = first + [one for one in found if one["clouds"] == condition and one["way"] == way and one["count"] > 1]
+                rows = first + [
+                    one for one in found if one["clouds"] == condition and one["way"] == way and one["count"] > 1
+                ]
                 rows.sort(key=lambda one: one["count"])
-                style = {"color": COLOURS(0.15 + 0.6 * clouds.index(condition) / max(1, len(clouds) - 1)), "ls": LINES[ways.index(way)], "marker": "o", "ms": 3, "label": f"{condition}, {way}"}
+                style = {
+                    "color": COLOURS(0.15 + 0.6 * clouds.index(condition) / max(1, len(clouds) - 1)),
+                    "ls": LINES[ways.index(way)],
+                    "marker": "o",
+                    "ms": 3,
+                    "label": f"{condition}, {way}",
+                }
                 counts = [one["count"] for one in rows]
-                within = [np.mean((np.array(one["distances"]) <= 0.01) & (np.array(one["angles"]) <= 10)) for one in rows]
+                within = [
+                    np.mean((np.array(one["distances"]) <= 0.01) & (np.array(one["angles"]) <= 10)) for one in rows
+                ]
                 left.plot(counts, within, **style)
                 right.plot(counts, [CENTIMETRES * np.median(one["distances"]) for one in rows], **style)
         left.set(ylabel="share within 1 cm and 10°", ylim=(0, 1.02))

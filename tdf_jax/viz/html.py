@@ -63,10 +63,16 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
     if marks.mesh is not None:
         x, y, z = CENTIMETRES * np.asarray(marks.mesh.vertices).T
         i, j, k = np.asarray(marks.mesh.faces).T
-        drawn.append(plotly.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, color=matplotlib.colors.to_hex(solid.CLAY), name="object", showlegend=True))
+        drawn.append(
+            plotly.Mesh3d(
+                x=x, y=y, z=z, i=i, j=j, k=k, color=matplotlib.colors.to_hex(solid.CLAY), name="object", showlegend=True
+            )
+        )
     else:
         x, y, z = CENTIMETRES * marks.points[:: max(1, len(marks.points) // SHOWN)].T
-        drawn.append(plotly.Scatter3d(x=x, y=y, z=z, mode="markers", marker={"size": 1.5, "color": CLOUD}, name="object"))
+        drawn.append(
+            plotly.Scatter3d(x=x, y=y, z=z, mode="markers", marker={"size": 1.5, "color": CLOUD}, name="object")
+        )
     for line, style in path_lines(landscape, marks, CLOUD):
         x, y, z = CENTIMETRES * line.T
         mode = "markers" if style.get("ls") == "" else "lines+markers"
@@ -92,5 +98,7 @@ def pages(function: str):
     try:
         import plotly.graph_objects
     except ImportError:
-        raise InputError(f"{function}: plotly is not installed; expected it for pages: pip install 'tdf_jax[pages]'") from None
+        raise InputError(
+            f"{function}: plotly is not installed; expected it for pages: pip install 'tdf_jax[pages]'"
+        ) from None
     return plotly.graph_objects

@@ -62,7 +62,9 @@ def imitation_figure(
     return figure
 
 
-def loss_figure(losses: Float[np.ndarray, "inits iterations"], best: int, title: str = "", rows: str = "start") -> Figure:
+def loss_figure(
+    losses: Float[np.ndarray, "inits iterations"], best: int, title: str = "", rows: str = "start"
+) -> Figure:
     """Loss against iteration of every start, as in figure 5 of the paper.
 
     Args:

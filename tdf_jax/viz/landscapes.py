@@ -89,7 +89,14 @@ def map_figure(landscape: Landscape, marks: Marks, title: str = "") -> Figure:
                 grid.flat[index].set_ylabel(f"{names[1]} from the middle (cm)")
         figure.colorbar(picture, ax=list(grid.flat[: len(panels)]), label="energy (no unit)", shrink=0.8, pad=0.01)
         legend = legend_of(grid[0, 0])
-        figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=4, facecolor=COLOURS(0.45), labelcolor="white")
+        figure.legend(
+            legend.values(),
+            legend.keys(),
+            loc="outside lower center",
+            ncols=4,
+            facecolor=COLOURS(0.45),
+            labelcolor="white",
+        )
         figure.suptitle(title)
     return figure
 
@@ -113,18 +120,34 @@ def isosurface_figure(landscape: Landscape, marks: Marks, title: str = "") -> Fi
         if marks.mesh is not None:
             pieces += solid.surface(CENTIMETRES * np.asarray(marks.mesh.triangles), LIGHT)
         else:
-            axes.scatter(*(CENTIMETRES * marks.points[:: max(1, len(marks.points) // SHOWN)].T), s=1.5, color=CLOUD, linewidths=0)
+            axes.scatter(
+                *(CENTIMETRES * marks.points[:: max(1, len(marks.points) // SHOWN)].T), s=1.5, color=CLOUD, linewidths=0
+            )
         for share, colour in zip(LEVELS, SURFACES):
             triangles = CENTIMETRES * isosurface(landscape, share)
             count = len(triangles)
             pieces += solid.Pieces(list(triangles), [(*colour[:3], SEE_THROUGH)] * count, [(*colour[:3], 0.0)] * count)
-            axes.plot([], [], [], color=colour, lw=6, alpha=2 * SEE_THROUGH, label=f"least {100 * share:.0f} % of the volume")
+            axes.plot(
+                [], [], [], color=colour, lw=6, alpha=2 * SEE_THROUGH, label=f"least {100 * share:.0f} % of the volume"
+            )
         axes.add_collection3d(pieces.collection())
         for points, style in path_lines(landscape, marks, CLOUD):
             axes.plot(*(CENTIMETRES * points.T), zorder=10, **style)
-        corners = CENTIMETRES * landscape.grid.points[:: landscape.grid.shape[0] - 1, :: landscape.grid.shape[1] - 1, :: landscape.grid.shape[2] - 1]
+        corners = (
+            CENTIMETRES
+            * landscape.grid.points[
+                :: landscape.grid.shape[0] - 1, :: landscape.grid.shape[1] - 1, :: landscape.grid.shape[2] - 1
+            ]
+        )
         low, high = corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]), xlabel="x (cm)", ylabel="y (cm)", zlabel="z (cm)")
+        axes.set(
+            xlim=(low[0], high[0]),
+            ylim=(low[1], high[1]),
+            zlim=(low[2], high[2]),
+            xlabel="x (cm)",
+            ylabel="y (cm)",
+            zlabel="z (cm)",
+        )
         axes.set_box_aspect(high - low, zoom=1.1)
         axes.view_init(**ANGLES)
         legend = legend_of(axes)
@@ -173,7 +196,11 @@ def save_slices(path: str | os.PathLike, landscape: Landscape, marks: Marks) -> 
     with matplotlib.rc_context(STYLE):
         figure = blank_figure(4.6, 4.2, layout="constrained")
         axes = figure.subplots()
-        figure.colorbar(matplotlib.cm.ScalarMappable(matplotlib.colors.Normalize(low, high), COLOURS), ax=axes, label="energy (no unit)")
+        figure.colorbar(
+            matplotlib.cm.ScalarMappable(matplotlib.colors.Normalize(low, high), COLOURS),
+            ax=axes,
+            label="energy (no unit)",
+        )
 
         def draw(index):
             axes.clear()
@@ -184,7 +211,11 @@ def save_slices(path: str | os.PathLike, landscape: Landscape, marks: Marks) -> 
                 place = CENTIMETRES * (points - grid.origin) @ grid.directions.T
                 here = np.abs(place[:, 2] - heights[index]) < NEAR * (heights[1] - heights[0])
                 axes.plot(*place[here, :2].T, **(style | {"ls": "", "marker": style.get("marker", ".")}))
-            axes.set(xlabel=f"{names[0]} from the middle (cm)", ylabel=f"{names[1]} from the middle (cm)", title=f"{names[2]} {heights[index]:+.1f} cm from the middle")
+            axes.set(
+                xlabel=f"{names[0]} from the middle (cm)",
+                ylabel=f"{names[1]} from the middle (cm)",
+                title=f"{names[2]} {heights[index]:+.1f} cm from the middle",
+            )
 
         animation = FuncAnimation(figure, draw, frames=len(heights), init_func=lambda: ())
         path = Path(path)
@@ -193,7 +224,9 @@ def save_slices(path: str | os.PathLike, landscape: Landscape, marks: Marks) -> 
             animation.save(part, writer=PillowWriter(fps=FRAMES_A_SECOND), dpi=GIF_DPI)
             replace_file("save_slices", path, part.read_bytes())
         except OSError as error:
-            raise InputError(f"save_slices(): cannot write {path} ({error}); expected a writable file in an existing folder") from None
+            raise InputError(
+                f"save_slices(): cannot write {path} ({error}); expected a writable file in an existing folder"
+            ) from None
         finally:
             part.unlink(missing_ok=True)
 
@@ -202,13 +235,25 @@ def check_landscape(function, landscape, axes):
     if len(landscape.grid.shape) != axes:
         raise InputError(f"{function}(): the grid has {len(landscape.grid.shape)} axes; expected {axes}")
     if landscape.turned is None:
-        raise InputError(f"{function}(): the landscape keeps each rotation's energies; expected the best, or one rotation's")
+        raise InputError(
+            f"{function}(): the landscape keeps each rotation's energies; expected the best, or one rotation's"
+        )
 
 
 def _map(axes, first, second, energy, low, high):
-    picture = axes.pcolormesh(first, second, energy.T, cmap=COLOURS, vmin=low, vmax=high, shading="nearest", rasterized=True)
+    picture = axes.pcolormesh(
+        first, second, energy.T, cmap=COLOURS, vmin=low, vmax=high, shading="nearest", rasterized=True
+    )
     if np.isfinite(energy).any() and np.nanmax(energy) > low:
-        axes.contour(first, second, energy.T, levels=np.linspace(low, high, CONTOURS + 1), colors="white", linewidths=0.3, alpha=0.7)
+        axes.contour(
+            first,
+            second,
+            energy.T,
+            levels=np.linspace(low, high, CONTOURS + 1),
+            colors="white",
+            linewidths=0.3,
+            alpha=0.7,
+        )
     axes.set_aspect("equal")
     axes.set(xlim=(first[0], first[-1]), ylim=(second[0], second[-1]))
     return picture
@@ -237,7 +282,12 @@ _MINIMISERS = {"ls": "", "marker": "x", "color": TRUTH, "label": "waypoints' min
 
 def path_lines(landscape, marks, colour="white"):
     """Points and matplotlib's style of each path, the demonstration's in a colour; the minimisers last."""
-    lines = [(landscape.waypoints, {"color": colour, "marker": "o", "mec": INK, "label": "demonstration, moved with the centroid"})]
+    lines = [
+        (
+            landscape.waypoints,
+            {"color": colour, "marker": "o", "mec": INK, "label": "demonstration, moved with the centroid"},
+        )
+    ]
     if marks.expected is not None:
         lines.append((marks.expected, {"color": "#e9c46a", "marker": "o", "mec": INK, "label": "true waypoints"}))
     if marks.path is not None:

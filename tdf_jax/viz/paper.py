@@ -76,10 +76,14 @@ def figure4_turn(runs: dict[tuple, Run]) -> Figure:
                 if moved == displacement:
                     steps = np.arange(len(run.expected))
                     angles = turned(run.trajectory, run.reference)
-                    axes.plot(steps, angles, SHAPE_STYLES[shape], color=SHAPE_COLOURS[shape], marker="o", ms=3, label=shape)
+                    axes.plot(
+                        steps, angles, SHAPE_STYLES[shape], color=SHAPE_COLOURS[shape], marker="o", ms=3, label=shape
+                    )
                     truth = turned(run.expected, run.reference)
             axes.plot(steps, truth, color=TRUTH, lw=1, ls=":", label="even turn to the goal")
-            axes.set_title("endpoint not displaced" if not any(displacement) else f"endpoint displaced by {vector(displacement)}")
+            axes.set_title(
+                "endpoint not displaced" if not any(displacement) else f"endpoint displaced by {vector(displacement)}"
+            )
             axes.set_xlabel("pose, from the pick to the place")
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
             _plain(axes)
@@ -118,7 +122,9 @@ def figure3(runs: dict[tuple, Run]) -> Figure:
         figure = blank_figure(WIDTH, 2.6, layout="constrained")
         for axes, (title, label, value) in zip(figure.subplots(1, len(panels)), panels):
             for (k, row), style, colour in zip(mean_over_seeds(runs, value).items(), ("-", "--"), (0.2, 0.7)):
-                axes.plot(list(row), list(row.values()), style, color=COLOURS(colour), marker="o", ms=3, label=f"k = {k:g}")
+                axes.plot(
+                    list(row), list(row.values()), style, color=COLOURS(colour), marker="o", ms=3, label=f"k = {k:g}"
+                )
             for distance in PAPER_DISTANCES:
                 axes.axvline(distance, color=CLOUD, lw=0.8, ls=":", zorder=0, label="the paper's distances")
             axes.set(ylabel=label, title=title)
@@ -154,13 +160,24 @@ def figure2(fields: dict[str, dict[str, Swept]]) -> Figure:
         figure.colorbar(picture, ax=grid, label="energy E (no unit)", shrink=0.9 if rows == 1 else 0.5, pad=0.01)
         legend = legend_of(grid[-1, 0])
         # White marks need a ground to be seen on.
-        figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=6, facecolor=COLOURS(0.45), labelcolor="white")
+        figure.legend(
+            legend.values(),
+            legend.keys(),
+            loc="outside lower center",
+            ncols=6,
+            facecolor=COLOURS(0.45),
+            labelcolor="white",
+        )
     return figure
 
 
 def _landscape(axes, panel: Swept, low: float, high: float):
-    picture = axes.pcolormesh(panel.x, panel.y, panel.energies.T, cmap=COLOURS, vmin=low, vmax=high, shading="nearest", rasterized=True)
-    axes.contour(panel.x, panel.y, panel.energies.T, levels=np.linspace(low, high, 13), colors="white", linewidths=0.3, alpha=0.7)
+    picture = axes.pcolormesh(
+        panel.x, panel.y, panel.energies.T, cmap=COLOURS, vmin=low, vmax=high, shading="nearest", rasterized=True
+    )
+    axes.contour(
+        panel.x, panel.y, panel.energies.T, levels=np.linspace(low, high, 13), colors="white", linewidths=0.3, alpha=0.7
+    )
     outline = panel.outline[:: max(1, len(panel.outline) // OUTLINE)]
     axes.scatter(*outline.T, s=0.6, color="white", alpha=0.5, linewidths=0)
     axes.plot([], [], ".", color="white", ms=3, label="object's points")
@@ -168,7 +185,9 @@ def _landscape(axes, panel: Swept, low: float, high: float):
     if not np.array_equal(panel.carried, panel.path):
         axes.plot(*panel.carried.T, color="white", lw=1.0, ls="--", label="turned with the mug")
     for point, marker, label in ((panel.path[0], "s", "start"), (panel.path[-1], "*", "end")):
-        axes.plot(*point, marker=marker, ls="", color="white", mec=INK, ms=6 if marker == "s" else 10, mew=0.8, label=label)
+        axes.plot(
+            *point, marker=marker, ls="", color="white", mec=INK, ms=6 if marker == "s" else 10, mew=0.8, label=label
+        )
     # Last: the first of them lies under the mark of the start.
     axes.plot(*panel.minimisers.T, ls="", marker="x", color=TRUTH, ms=5, mew=1.3, label=r"minimisers $x_i^*$")
     axes.set_aspect("equal")

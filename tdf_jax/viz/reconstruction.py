@@ -71,7 +71,9 @@ def transfer_figure(panels: Sequence[Panel], title: str = "") -> Figure:
     for panel, *boxes in zip(panels, true, found):
         low, high = panel.triangles.min(axis=(0, 1)), panel.triangles.max(axis=(0, 1))
         reach = (high - low).max()  # a box found still farther away is cut, rather than make the others small
-        contents.append(np.concatenate([panel.triangles.reshape(-1, 3), np.clip(np.concatenate(boxes), low - reach, high + reach)]))
+        contents.append(
+            np.concatenate([panel.triangles.reshape(-1, 3), np.clip(np.concatenate(boxes), low - reach, high + reach)])
+        )
     edge = _edge(contents)
     with matplotlib.rc_context(STYLE):
         figure = _figure(len(panels), 1, title, edge)
@@ -109,7 +111,9 @@ def _corner(figure: Figure, index: int, rows: int) -> tuple[float, float]:
 
 def _name(figure: Figure, index: int, rows: int, words: str) -> None:
     x, y = _corner(figure, index, rows)
-    figure.text((x + PANEL / 2) / figure.get_figwidth(), (y + 0.04) / figure.get_figheight(), words, ha="center", va="bottom")
+    figure.text(
+        (x + PANEL / 2) / figure.get_figwidth(), (y + 0.04) / figure.get_figheight(), words, ha="center", va="bottom"
+    )
 
 
 def _axes(figure: Figure, index: int, rows: int, row: int, label: str) -> Axes3D:

@@ -114,7 +114,9 @@ def frame(axes: Axes3D, content: Float[np.ndarray, "points 3"], size: Float[np.n
     axes.view_init(**VIEW)
 
 
-def panels(views: Sequence[tuple[str, View]], columns: int, box: Float[np.ndarray, "8 3"], poses: int, share: float = 0.93) -> Figure:
+def panels(
+    views: Sequence[tuple[str, View]], columns: int, box: Float[np.ndarray, "8 3"], poses: int, share: float = 0.93
+) -> Figure:
     """Three-dimensional views at one scale, with a legend below.
 
     Args:
@@ -136,7 +138,13 @@ def panels(views: Sequence[tuple[str, View]], columns: int, box: Float[np.ndarra
             row, column = divmod(index, columns)
             tall = (1 - foot) / rows
             axes = figure.add_axes(
-                ((column + 0.07) / columns, foot + tall * (rows - 1 - row + (0.93 - share) / 2), 0.83 / columns, share * tall), projection="3d"
+                (
+                    (column + 0.07) / columns,
+                    foot + tall * (rows - 1 - row + (0.93 - share) / 2),
+                    0.83 / columns,
+                    share * tall,
+                ),
+                projection="3d",
             )
             draw(axes, view, box)
             frame(axes, contents[index], size)

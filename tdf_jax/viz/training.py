@@ -43,7 +43,9 @@ def training_figure(rows: Sequence[dict]) -> Figure:
                 panel.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1, 0.5)))
             panel.grid(color="#dddddd", lw=0.5)
         shares = [(row["step"], row["transfer"]["success"]) for row in rows if "transfer" in row]
-        transfer = axes[0, 1].plot(*np.array(shares).reshape(-1, 2).T, color="#2a6f97", ls="--", marker="o", ms=2.5, lw=1)
+        transfer = axes[0, 1].plot(
+            *np.array(shares).reshape(-1, 2).T, color="#2a6f97", ls="--", marker="o", ms=2.5, lw=1
+        )
         axes[0, 0].legend(frameon=False)
         axes[0, 1].legend(transfer, ["transfers within 2 cm and 20°"], frameon=False)
         for panel in axes[1]:

@@ -27,8 +27,16 @@ def precisions(function, *arguments):
             if equation.primitive.name == "dot_general":
                 precision = equation.params["precision"]
                 found |= set(precision) if isinstance(precision, tuple) else {precision}
-            stack += [leaf for leaf in jax.tree.leaves(equation.params, is_leaf=is_jaxpr) if isinstance(leaf, jax.extend.core.Jaxpr)]
-            stack += [leaf.jaxpr for leaf in jax.tree.leaves(equation.params, is_leaf=is_jaxpr) if isinstance(leaf, jax.extend.core.ClosedJaxpr)]
+            stack += [
+                leaf
+                for leaf in jax.tree.leaves(equation.params, is_leaf=is_jaxpr)
+                if isinstance(leaf, jax.extend.core.Jaxpr)
+            ]
+            stack += [
+                leaf.jaxpr
+                for leaf in jax.tree.leaves(equation.params, is_leaf=is_jaxpr)
+                if isinstance(leaf, jax.extend.core.ClosedJaxpr)
+            ]
     return found
 
 

@@ -58,7 +58,9 @@ def test_the_peers_trajectory_losses_and_gradients_are_the_originals(golden, sta
     descriptors = network.descriptors(x.reshape(1, -1, 3), latents[:1]).reshape(*x.shape[:2], -1)
     centre = arrays["traj_query"].mean(0)
     zero = torch.zeros(3, dtype=torch.float64)
-    problem = ndf_torch.Problem(latents[1:], zero, arrays["traj_query"], descriptors, R_ref, arrays["traj_t_ref"], 0.0, 1.0)
+    problem = ndf_torch.Problem(
+        latents[1:], zero, arrays["traj_query"], descriptors, R_ref, arrays["traj_t_ref"], 0.0, 1.0
+    )
     rot, t = (arrays[f"traj_{name}"].clone().requires_grad_() for name in ("rot", "t"))
     R = ndf_torch.exponential(rot)
     loss = ndf_torch.descriptor_losses(network, problem, R[None], (R @ centre + t)[None])[0]
@@ -96,12 +98,20 @@ def test_operations_are_those_of_the_folded_network():
     latent = jax.ShapeDtypeStruct((config.latent, 3), np.float32)
     shapes = {name: jax.ShapeDtypeStruct(shape, np.float32) for name, shape in parameter_shapes(config).items()}
     folded = jax.eval_shape(lambda params, z: condition(params, config, z), unflatten_dict(shapes, sep="."), latent)
-    sizes = folded.latent.size + folded.into[1].size + sum(kernel.size for block in folded.blocks for kernel in (block[0], block[2]))
+    sizes = (
+        folded.latent.size
+        + folded.into[1].size
+        + sum(kernel.size for block in folded.blocks for kernel in (block[0], block[2]))
+    )
     assert flops.decoder(5) == 5 * 2 * sizes
     # The encoder's maps of all points: everything but the edges, the read-out, and the pooled halves of blocks 1 to 4.
     maps = {name: np.prod(shape) for name, shape in parameter_shapes(config).items() if name.startswith("encoder.")}
     left_out = [name for name in maps if "conv_pos" in name or "_c." in name]
-    pooled = sum(maps[f"encoder.block_{b}.{name}.kernel"] / 2 for b in range(1, 5) for name in ("actvn_0.map_to_dir", "shortcut.map_to_feat"))
+    pooled = sum(
+        maps[f"encoder.block_{b}.{name}.kernel"] / 2
+        for b in range(1, 5)
+        for name in ("actvn_0.map_to_dir", "shortcut.map_to_feat")
+    )
     every_point = sum(maps.values()) - sum(maps[name] for name in left_out) - pooled
     edges = 2 * 4 * 20 * config.vector_hidden + 3 * 2 * 3 * config.vector_hidden
     assert flops.encoder(1) == pytest.approx(2 * (edges + 3 * every_point))
@@ -145,7 +155,9 @@ def test_competitors_take_turns_after_a_first_call():
 
 
 def test_a_part_of_the_work_counts_as_the_whole():
-    found = measure(row(torch={"scale": 10.0, "note": "a tenth"}, tdf_jax={}), Scripted({"torch": 4.0, "tdf_jax": 0.5}), {}, 1)
+    found = measure(
+        row(torch={"scale": 10.0, "note": "a tenth"}, tdf_jax={}), Scripted({"torch": 4.0, "tdf_jax": 0.5}), {}, 1
+    )
     assert found["ratios"] == {"torch / tdf_jax": 80.0}
     assert found["competitors"]["torch"]["note"] == "a tenth"
 
@@ -160,9 +172,16 @@ def test_what_disagrees_is_not_timed():
 
 
 def test_a_competitor_that_dies_is_reported_and_the_others_are_measured():
-    found = measure(row(torch={}, torch_tuned={}, tdf_jax={}), Scripted({"torch_tuned": 2.0, "tdf_jax": 0.5}, dead=("torch",)), {}, 1)
+    found = measure(
+        row(torch={}, torch_tuned={}, tdf_jax={}),
+        Scripted({"torch_tuned": 2.0, "tdf_jax": 0.5}, dead=("torch",)),
+        {},
+        1,
+    )
     assert found["ratios"] == {"torch_tuned / tdf_jax": 4.0}
-    assert gate.failed_checks({"parity": [], "rows": {"made_up": found}}) == ["made_up: torch failed: the process ended with -9"]
+    assert gate.failed_checks({"parity": [], "rows": {"made_up": found}}) == [
+        "made_up: torch failed: the process ended with -9"
+    ]
 
 
 def test_not_a_number_fails_a_check():
@@ -239,7 +258,17 @@ def test_without_torch_the_extra_is_named(capsys, monkeypatch):
 
 def test_full_sizes_have_the_rows_and_their_operations():
     names = [row.name for row in rows(command_line.Sizes())]
-    assert names == ["encode_1000", "encode_1500", "step_1", "step_10", "step_64", "target", "target_rates", "landscape", "train"]
+    assert names == [
+        "encode_1000",
+        "encode_1500",
+        "step_1",
+        "step_10",
+        "step_64",
+        "target",
+        "target_rates",
+        "landscape",
+        "train",
+    ]
 
 
 def test_what_does_not_fit_into_memory_is_measured_with_fewer_starts(monkeypatch):

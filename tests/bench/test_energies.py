@@ -10,7 +10,11 @@ from bench import energies
 
 
 def test_it_keeps_what_is_done_and_tells_the_distribution(small_model, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(tdf, "load_model", lambda name: dataclasses.replace(small_model, info=tdf.ModelInfo("small", "a test", cloud_points=40)))
+    monkeypatch.setattr(
+        tdf,
+        "load_model",
+        lambda name: dataclasses.replace(small_model, info=tdf.ModelInfo("small", "a test", cloud_points=40)),
+    )
     monkeypatch.setattr(energies, "QUERIES", 8)
     short = tdf.OptimizeConfig(inits=2, iterations=3)
     compared, kept = [], energies.compare
@@ -29,6 +33,8 @@ def test_it_keeps_what_is_done_and_tells_the_distribution(small_model, tmp_path,
     assert all(np.isfinite(ratios)) and max(ratios) < 1.05  # three steps of Adam are not far
     lines = capsys.readouterr().out.splitlines()[-2:]
     assert lines[0].startswith(f"1 rows, energy of solve over Adam's: mean {ratios[0]:.4f}")
-    assert lines[1].startswith(f"2 pairs, energy of solve over Adam's: mean {np.mean(ratios[1:]):.4f}; 0 %: {min(ratios[1:]):.4f}")
+    assert lines[1].startswith(
+        f"2 pairs, energy of solve over Adam's: mean {np.mean(ratios[1:]):.4f}; 0 %: {min(ratios[1:]):.4f}"
+    )
     (tmp_path / "energies.json").write_text("{")
     assert energies.main(words) == 2

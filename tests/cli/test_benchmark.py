@@ -43,7 +43,9 @@ def tree(folder):
 
 def read(folder):
     """The record; a NaN or an infinity is none of JSON."""
-    return json.loads((folder / "benchmark.json").read_text(), parse_constant=lambda word: pytest.fail(f"{word} in the record"))
+    return json.loads(
+        (folder / "benchmark.json").read_text(), parse_constant=lambda word: pytest.fail(f"{word} in the record")
+    )
 
 
 def told(folder):
@@ -65,7 +67,14 @@ def folder(weights, tmp_path_factory):
 
 
 def test_a_run_writes_a_page_a_record_and_pictures_and_nothing_beside_them(folder):
-    assert {path.name for path in folder.iterdir()} == {"benchmark.md", "benchmark.json", "truth.png", "errors.png", "reliability.png", "runs"}
+    assert {path.name for path in folder.iterdir()} == {
+        "benchmark.md",
+        "benchmark.json",
+        "truth.png",
+        "errors.png",
+        "reliability.png",
+        "runs",
+    }
     assert [path.name for path in folder.parent.iterdir()] == ["out"]
     assert all(path.read_bytes().startswith(PNG) for path in folder.glob("*.png"))
     assert len(list((folder / "runs").iterdir())) == 2 * 3
@@ -80,12 +89,18 @@ def test_the_record_has_every_task_by_every_method_and_the_settings(folder, weig
     assert [(one["task"], one["method"], one["path"], one["displacement"]) for one in record["tasks"]] == [
         (index, method, path, "none") for index, path in enumerate(("line", "semicircle")) for method in METHODS
     ]
-    assert [(row["method"], row["tasks"], row["objects"]) for row in record["rows"]] == [(method, 2, 2) for method in METHODS]
+    assert [(row["method"], row["tasks"], row["objects"]) for row in record["rows"]] == [
+        (method, 2, 2) for method in METHODS
+    ]
     for one in record["tasks"]:
         # the goal is given
         assert len(one["distances"]) == 7 and one["distances"][-1] < 1e-5 and one["angles"][-1] < 0.1
         assert (one["confidence"] is not None) == (one["method"] == "tdf_jax")
-    assert record["settings"] | {"pairs": 2, "seed": 0, "height": 0.12, "clouds": ["full"], "weights": str(weights), "demonstrations": []} == record["settings"]
+    assert (
+        record["settings"]
+        | {"pairs": 2, "seed": 0, "height": 0.12, "clouds": ["full"], "weights": str(weights), "demonstrations": []}
+        == record["settings"]
+    )
     assert record["weights"] == {"name": "small", "source": "a test"} and "demonstrations" not in record
     assert record["reliability"]["picks"] == 2
 
@@ -95,7 +110,9 @@ def test_errors_of_a_copy_are_those_by_hand(folder):
     for one in read(folder)["tasks"]:
         case = mug_case(0, one["task"])
         if one["method"] == "copy":
-            assert one["distances"][0] == pytest.approx(np.linalg.norm(case.T_world_place_b[:3, 3] - case.T_world_place_a[:3, 3]), abs=1e-5)
+            assert one["distances"][0] == pytest.approx(
+                np.linalg.norm(case.T_world_place_b[:3, 3] - case.T_world_place_a[:3, 3]), abs=1e-5
+            )
             turn = case.T_world_place_a[:3, :3].T @ case.T_world_place_b[:3, :3]
             assert one["angles"][0] == pytest.approx(np.degrees(np.arccos((np.trace(turn) - 1) / 2)), abs=0.05)
 
@@ -108,7 +125,10 @@ def test_the_page_tells_the_command_that_made_it(folder, weights):
 def test_the_methods_are_told_as_a_shell_takes_them(everything):
     words = shlex.split(told(everything).split("`")[1])
     after = words[words.index("--methods") + 1 :]
-    assert after[: [word.startswith("--") for word in [*after, "--"]].index(True)] == [*METHODS, "oracle correspondences"]
+    assert after[: [word.startswith("--") for word in [*after, "--"]].index(True)] == [
+        *METHODS,
+        "oracle correspondences",
+    ]
 
 
 def test_the_path_of_the_page_is_printed(folder, weights, capsys):
@@ -133,7 +153,9 @@ def test_a_damaged_file_of_an_earlier_run_is_told(folder, weights, tmp_path, cap
         path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(SystemExit) as stop:
         run("--weights", weights, *PLAIN, "--out", again)
-    assert stop.value.code == 2 and re.search(rf"tdf: error: tdf benchmark: {again}/runs/\w+\.npz cannot be read .*delete it", capsys.readouterr().err)
+    assert stop.value.code == 2 and re.search(
+        rf"tdf: error: tdf benchmark: {again}/runs/\w+\.npz cannot be read .*delete it", capsys.readouterr().err
+    )
     assert told(again) == told(folder)
 
 
@@ -167,10 +189,16 @@ def test_clouds_meshes_and_demonstrations_add_to_what_there_was(folder, everythi
         if (name, method) != ("cup", "oracle correspondences")
     ]
     assert kinds == expected
-    shared = [one for one in record["tasks"] if one["clouds"] == "full" and one["instance"] != "cup" and not one["method"].startswith("oracle")]
+    shared = [
+        one
+        for one in record["tasks"]
+        if one["clouds"] == "full" and one["instance"] != "cup" and not one["method"].startswith("oracle")
+    ]
     assert shared == before["tasks"]
     assert (everything / "demonstrations.png").read_bytes().startswith(PNG) and "demonstrations.png" in told(everything)
-    assert record["settings"]["meshes"] == str(real) and f"--meshes {real} --poses 2 --demonstrations 1 3" in told(everything)
+    assert record["settings"]["meshes"] == str(real) and f"--meshes {real} --poses 2 --demonstrations 1 3" in told(
+        everything
+    )
 
 
 def test_real_meshes_are_of_their_own_size_with_a_penetration(everything):
@@ -179,7 +207,13 @@ def test_real_meshes_are_of_their_own_size_with_a_penetration(everything):
 
 
 def test_demonstrations_are_of_every_fifth_task_of_all_clouds(everything):
-    expected = len([one for one in read(everything)["tasks"] if (one["clouds"], one["method"]) == ("full", "copy") and one["task"] % 5 == 0])
+    expected = len(
+        [
+            one
+            for one in read(everything)["tasks"]
+            if (one["clouds"], one["method"]) == ("full", "copy") and one["task"] % 5 == 0
+        ]
+    )
     assert expected >= 1
     found = read(everything)["demonstrations"]
     assert [(one["clouds"], one["count"], one["way"]) for one in found] == [
@@ -191,10 +225,27 @@ def test_demonstrations_are_of_every_fifth_task_of_all_clouds(everything):
 def test_real_meshes_alone_with_the_paths_in_turn(weights, real, tmp_path):
     shutil.copytree(real, two := tmp_path / "two")
     shutil.copy(two / "cup.obj", two / "mug.obj")
-    (two / "meshes.json").write_text(json.dumps(dict.fromkeys(("cup.obj", "mug.obj"), {"unit": 1, "up": "+z", "handle": "+x"})))
-    run("--weights", weights, "--pairs", 0, "--meshes", two, "--poses", 2, "--methods", "copy", "--out", tmp_path / "out")
+    (two / "meshes.json").write_text(
+        json.dumps(dict.fromkeys(("cup.obj", "mug.obj"), {"unit": 1, "up": "+z", "handle": "+x"}))
+    )
+    run(
+        "--weights",
+        weights,
+        "--pairs",
+        0,
+        "--meshes",
+        two,
+        "--poses",
+        2,
+        "--methods",
+        "copy",
+        "--out",
+        tmp_path / "out",
+    )
     tasks = read(tmp_path / "out")["tasks"]
-    assert [(one["instance"], one["path"]) for one in tasks] == [(name, path) for name in ("cup", "mug") for path in ("line", "semicircle")]
+    assert [(one["instance"], one["path"]) for one in tasks] == [
+        (name, path) for name in ("cup", "mug") for path in ("line", "semicircle")
+    ]
     assert [one["task"] for one in tasks] == [mesh_index(name, pose) for name in ("cup", "mug") for pose in (0, 1)]
     assert not (tmp_path / "out" / "reliability.png").exists()
 
@@ -218,9 +269,19 @@ def test_all_methods_is_every_method(weights, tmp_path, monkeypatch):
 
 def test_pictures_show_every_path_and_goals_where_there_are_enough_tasks(weights, tmp_path, monkeypatch):
     seen = []
-    monkeypatch.setattr("tdf_jax.viz.evaluation.truth_figure", lambda tasks: seen.append([(one.path, one.displacement) for one in tasks]) or matplotlib.figure.Figure())
+    monkeypatch.setattr(
+        "tdf_jax.viz.evaluation.truth_figure",
+        lambda tasks: seen.append([(one.path, one.displacement) for one in tasks]) or matplotlib.figure.Figure(),
+    )
     run("--weights", weights, "--pairs", 24, "--methods", "copy", "--out", tmp_path / "out")
-    assert {path for path, _ in seen[0]} == {"line", "semicircle", "wave", "lift_over", "tilt_and_pour", "hang_on_rack"} and len(seen[0]) == 6
+    assert {path for path, _ in seen[0]} == {
+        "line",
+        "semicircle",
+        "wave",
+        "lift_over",
+        "tilt_and_pour",
+        "hang_on_rack",
+    } and len(seen[0]) == 6
     assert {goal for _, goal in seen[0]} == {"none", "10 cm", "30 cm", "opposite"}
 
 
@@ -270,14 +331,30 @@ def test_a_folder_that_cannot_be_made_is_told_before_the_work(place, weights, tm
     monkeypatch.setattr("tdf_jax.evaluation.path_runs.run", lambda *_, **__: pytest.fail("the work has begun"))
     with pytest.raises(SystemExit) as stop:
         run("--weights", weights, "--out", tmp_path / place)
-    assert stop.value.code == 2 and f"tdf: error: tdf benchmark: cannot make the folder {tmp_path / place}" in capsys.readouterr().err
+    assert (
+        stop.value.code == 2
+        and f"tdf: error: tdf benchmark: cannot make the folder {tmp_path / place}" in capsys.readouterr().err
+    )
     assert tree(tmp_path) == {"file": b"mine"}
 
 
 def test_a_method_that_can_try_nothing_is_told(weights, real, tmp_path, capsys):
     """The oracle has no correspondences on a real mesh."""
     with pytest.raises(SystemExit) as stop:
-        run("--weights", weights, "--pairs", 0, "--meshes", real, "--poses", 1, "--methods", "oracle correspondences", "--out", tmp_path / "out")
+        run(
+            "--weights",
+            weights,
+            "--pairs",
+            0,
+            "--meshes",
+            real,
+            "--poses",
+            1,
+            "--methods",
+            "oracle correspondences",
+            "--out",
+            tmp_path / "out",
+        )
     assert stop.value.code == 2 and "--methods" in capsys.readouterr().err
 
 
@@ -293,7 +370,9 @@ def test_every_condition_can_be_asked_for():
     assert typing.get_args(Cloud) == CONDITIONS
 
 
-@pytest.mark.parametrize(("words", "named"), [(("--help",), "benchmark"), (("benchmark", "--help"), "--demonstrations")])
+@pytest.mark.parametrize(
+    ("words", "named"), [(("--help",), "benchmark"), (("benchmark", "--help"), "--demonstrations")]
+)
 def test_help_tells_of_it(words, named, capsys):
     with pytest.raises(SystemExit) as stop:
         main(words)
@@ -305,8 +384,25 @@ def test_help_tells_of_it(words, named, capsys):
 
 def made(pick, angle, **about):
     """A score: the errors of the pick, and 1 cm along the path."""
-    numbers = {"best_path": 0.01, "frechet": 0.01, "jerk": 1.0, "longest_step": 1.0, "expected_step": 1.0, "penetration": None, "starts": 1, "seconds": 0.0}
-    about = {"method": "tdf_jax", "task": 0, "instance": "mug", "path": "line", "displacement": "none", "clouds": "full", "confidence": None} | about
+    numbers = {
+        "best_path": 0.01,
+        "frechet": 0.01,
+        "jerk": 1.0,
+        "longest_step": 1.0,
+        "expected_step": 1.0,
+        "penetration": None,
+        "starts": 1,
+        "seconds": 0.0,
+    }
+    about = {
+        "method": "tdf_jax",
+        "task": 0,
+        "instance": "mug",
+        "path": "line",
+        "displacement": "none",
+        "clouds": "full",
+        "confidence": None,
+    } | about
     return Score(distances=[pick, *[0.01] * 5, 0.0], angles=[angle] * 7, best_pick=(pick, angle), **numbers, **about)
 
 
@@ -314,7 +410,11 @@ def test_the_truth_is_drawn_with_what_was_shown():
     tasks = [make_task(mug_case(0, index, points=60), 0, index) for index in (1, 8, 21)]
     figure = truth_figure(tasks)
     *panels, _ = figure.axes
-    assert [axes.get_title() for axes in panels] == ["semicircle", "wave, goal moved by 10 cm", "lift over, goal opposite"]
+    assert [axes.get_title() for axes in panels] == [
+        "semicircle",
+        "wave, goal moved by 10 cm",
+        "lift over, goal opposite",
+    ]
     for axes, task in zip(panels, tasks, strict=True):
         drawn = {line.get_label(): np.column_stack(line.get_data_3d()) / 100 for line in axes.lines}
         np.testing.assert_allclose(drawn["trajectory of the query frame"], task.expected.translations, atol=1e-6)
@@ -329,10 +429,21 @@ def steps(axes):
 
 
 def test_errors_are_drawn_as_shares_of_tasks():
-    scores = [made(pick, 0.0, method=method) for method, ones in {"PCA": (0.05, 0.01, 0.3), "tdf_jax": (0.002, 0.001)}.items() for pick in ones]
+    scores = [
+        made(pick, 0.0, method=method)
+        for method, ones in {"PCA": (0.05, 0.01, 0.3), "tdf_jax": (0.002, 0.001)}.items()
+        for pick in ones
+    ]
     pick, path = errors_figure(scores, "tdf_jax").axes
-    assert (pick.get_xlabel(), path.get_xlabel(), pick.get_ylabel()) == ("pick error (cm)", "path error (cm)", "share of tasks within")
-    for axes, error in ((pick, lambda one: 100 * one.distances[0]), (path, lambda one: 100 * sum(one.distances[:6]) / 6)):
+    assert (pick.get_xlabel(), path.get_xlabel(), pick.get_ylabel()) == (
+        "pick error (cm)",
+        "path error (cm)",
+        "share of tasks within",
+    )
+    for axes, error in (
+        (pick, lambda one: 100 * one.distances[0]),
+        (path, lambda one: 100 * sum(one.distances[:6]) / 6),
+    ):
         for method, ones in by_method(scores).items():
             drawn, errors = steps(axes)[method], np.array([error(one) for one in ones])
             for x in (0.05, 0.15, 1.5, 4.9, 5.1, 19.0):  # the last point at or before x holds until the next
@@ -346,7 +457,10 @@ def test_errors_are_drawn_as_shares_of_tasks():
 def test_methods_are_told_apart_and_named_once():
     names = [f"method {index}" for index in range(14)]
     figure = errors_figure([made(0.01, 0.0, method=name) for name in names], "method 3")
-    looks = {(line.get_color() if isinstance(line.get_color(), str) else tuple(line.get_color()), line.get_linestyle()) for line in figure.axes[0].lines}
+    looks = {
+        (line.get_color() if isinstance(line.get_color(), str) else tuple(line.get_color()), line.get_linestyle())
+        for line in figure.axes[0].lines
+    }
     assert len(looks) == 14
     (legend,) = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == names
@@ -354,8 +468,13 @@ def test_methods_are_told_apart_and_named_once():
 
 def test_reliability_is_drawn_from_bins_with_counts_of_right_and_wrong():
     rng = np.random.default_rng(0)
-    scores = [made(0.01 if rng.uniform() < sure else 0.2, 0.0, confidence=float(sure)) for sure in rng.uniform(size=200)]
-    predicted, right = np.array([one.confidence for one in scores]), np.array([float(one.distances[0] < 0.02) for one in scores])
+    scores = [
+        made(0.01 if rng.uniform() < sure else 0.2, 0.0, confidence=float(sure)) for sure in rng.uniform(size=200)
+    ]
+    predicted, right = (
+        np.array([one.confidence for one in scores]),
+        np.array([float(one.distances[0] < 0.02) for one in scores]),
+    )
     rows = bins(predicted, right)
     rates, counts = reliability_figure([*scores, made(0.5, 0.0)], rows).axes
     points = rates.containers[0]
@@ -392,5 +511,7 @@ def test_several_demonstrations_are_drawn_for_every_way_from_the_first_on():
 
 
 def test_demonstrations_need_not_begin_with_one():
-    found = [{"clouds": "full", "count": 5, "way": way, "distances": [0.01], "angles": [5.0]} for way in ("mean", "median")]
+    found = [
+        {"clouds": "full", "count": 5, "way": way, "distances": [0.01], "angles": [5.0]} for way in ("mean", "median")
+    ]
     assert {len(line) for line in steps(demonstrations_figure(found).axes[0]).values()} == {1}

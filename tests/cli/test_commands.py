@@ -93,13 +93,19 @@ def record_of(folder):
 def test_the_default_method_carries(imitate, watched, capsys):
     record = imitate("--points", 60, "--poses", 4, "--queries", 8, "--inits", 6)
     assert record["settings"]["method"] == "carry" and record["energy"] is None
-    assert record["optimiser"] == dataclasses.asdict(tdf.CarryConfig(scouts=6)) | {"steps": list(tdf.CarryConfig().steps)}
+    assert record["optimiser"] == dataclasses.asdict(tdf.CarryConfig(scouts=6)) | {
+        "steps": list(tdf.CarryConfig().steps)
+    }
     np.testing.assert_array_equal(np.float32(record["energies"]), watched[0].energies)
     assert record["confidence"] is None  # not calibrated for these weights
     modes = tdf.cluster_poses(watched[0].trajectories[:, 0], watched[0].energies)
     assert [mode["energy"] for mode in record["modes"]] == [mode.energy for mode in modes]
     out = capsys.readouterr().out
-    assert "6 starts of the pick, 4 poses, 8 queries" in out and "(of the best pick)" in out and f"{len(modes)} distinct pick" in out
+    assert (
+        "6 starts of the pick, 4 poses, 8 queries" in out
+        and "(of the best pick)" in out
+        and f"{len(modes)} distinct pick" in out
+    )
 
 
 def test_the_papers_energy_can_be_solved(imitate, watched, capsys):
@@ -249,7 +255,9 @@ def test_an_own_target_has_no_truth(imitate, tmp_path, capsys, kind):
 
 def test_scale_and_pose_of_an_own_target(tmp_path):
     np.save(tmp_path / "cloud.npy", cloud := np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32))
-    settings = Settings(target=tmp_path / "cloud.npy", category="mug", scale=0.1, target_pose="random", poses=3, queries=4)
+    settings = Settings(
+        target=tmp_path / "cloud.npy", category="mug", scale=0.1, target_pose="random", poses=3, queries=4
+    )
     made = scene.make_scene(dataclasses.replace(settings, trajectory="line"), jax.random.key(0))
     T = made.T_world_target
     np.testing.assert_allclose(made.points, 0.1 * cloud @ T[:3, :3].T + T[:3, 3], atol=1e-6)
@@ -486,11 +494,19 @@ def test_train_refuses_unwritable_places_before_training(refusal, tmp_path, monk
 
 def test_train_refuses_bad_numbers_before_training(refusal, tmp_path, monkeypatch):
     monkeypatch.setattr("tdf_jax.cli.train.run", lambda *_: pytest.fail("the work has begun"))
-    check(refusal("train", "--out", tmp_path / "run", "--workers", -1), "^tdf: error: tdf train: --workers is -1; expected 1 or more, or 0")
-    check(refusal("train", "--out", tmp_path / "run", "--network.asymmetry", 1), "network.asymmetry is 1.0; expected 0 to less than 1")
+    check(
+        refusal("train", "--out", tmp_path / "run", "--workers", -1),
+        "^tdf: error: tdf train: --workers is -1; expected 1 or more, or 0",
+    )
+    check(
+        refusal("train", "--out", tmp_path / "run", "--network.asymmetry", 1),
+        "network.asymmetry is 1.0; expected 0 to less than 1",
+    )
 
 
-@pytest.mark.parametrize(("given", "asked", "trained"), [(0.0, None, 0.0), (0.2, None, 0.2), (0.0, 0.1, 0.1), (0.2, 0.1, 0.1)])
+@pytest.mark.parametrize(
+    ("given", "asked", "trained"), [(0.0, None, 0.0), (0.2, None, 0.2), (0.0, 0.1, 0.1), (0.2, 0.1, 0.1)]
+)
 def test_a_run_keeps_the_asymmetry_of_the_weights_it_goes_on_from_unless_another_is_asked_for(
     given, asked, trained, weights, tmp_path, monkeypatch, capsys
 ):
@@ -508,7 +524,10 @@ def test_a_run_keeps_the_asymmetry_of_the_weights_it_goes_on_from_unless_another
     monkeypatch.setattr("tdf_jax.cli.train.joined", lambda sets: sets[0])
     monkeypatch.setattr("tdf_jax.viz.training.training_figure", lambda _: None)
     monkeypatch.setattr("tdf_jax.viz.style.save_figure", lambda *_: None)
-    sizes = {name: getattr(model.config, name) for name in ("latent", "vector_hidden", "vector_width", "decoder_width", "blocks")}
+    sizes = {
+        name: getattr(model.config, name)
+        for name in ("latent", "vector_hidden", "vector_width", "decoder_width", "blocks")
+    }
     options = [word for name, size in sizes.items() for word in (f"--network.{name.replace('_', '-')}", size)]
     options += [] if asked is None else ["--network.asymmetry", asked]
     run("train", "--out", tmp_path / "run", "--data", tmp_path, "--start-from", start, *options, "--workers", 3)
@@ -537,14 +556,29 @@ def evaluation(weights, real, tmp_path_factory):
     """The record of a run with all options but pictures, and its model card."""
     folder = tmp_path_factory.mktemp("evaluation")
     words = ("--meshes", real, "--poses", 2, "--clouds", "full", "views1", "half", "--baselines")
-    run("evaluate", "--weights", weights, *EVALUATE, *words, "--json", folder / "scores.json", "--card", folder / "small.md")
+    run(
+        "evaluate",
+        "--weights",
+        weights,
+        *EVALUATE,
+        *words,
+        "--json",
+        folder / "scores.json",
+        "--card",
+        folder / "small.md",
+    )
     assert {file.name for file in folder.iterdir()} == {"scores.json", "small.md"}
     return json.loads((folder / "scores.json").read_text()), (folder / "small.md").read_text()
 
 
 def test_an_evaluation_has_a_row_for_every_method_condition_and_set(evaluation, real):
     methods, conditions = ("small", "random weights", "PCA", "ICP"), ("full", "views1", "half")
-    expected = [(objects, cloud, method) for objects in ("generated mugs", "real mugs") for cloud in conditions for method in methods]
+    expected = [
+        (objects, cloud, method)
+        for objects in ("generated mugs", "real mugs")
+        for cloud in conditions
+        for method in methods
+    ]
     evaluation, _ = evaluation
     rows = evaluation["rows"]
     assert [(row["set"], row["clouds"], row["method"]) for row in rows] == expected
@@ -567,11 +601,17 @@ def test_a_plain_evaluation_gives_the_same_numbers_and_a_table(evaluation, weigh
     title, heads, units, line = out.splitlines()
     assert title == "generated mugs: 2 objects, 2 transfers of the handle; best of 2 starts by loss"
     cells = re.split(r"  +", line)
-    assert cells[:4] == ["small", "full", f"{row['iou']:.3f}", f"{row['iou_refined']:.3f}"] and cells[-4] == str(row["flips"])
+    assert cells[:4] == ["small", "full", f"{row['iou']:.3f}", f"{row['iou_refined']:.3f}"] and cells[-4] == str(
+        row["flips"]
+    )
     low, high = row["interval_2cm_20deg"]
     assert cells[-1] == f"{100 * row['success_2cm_20deg']:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
     ends = {name: heads.index(name) + len(name) for name in ("IoU", "rotation, deg", "flips", "2 cm, 20 deg")}
-    assert ends["2 cm, 20 deg"] == len(line) and line[: ends["IoU"]].endswith(cells[2]) and line[: ends["flips"]].endswith(cells[-4])
+    assert (
+        ends["2 cm, 20 deg"] == len(line)
+        and line[: ends["IoU"]].endswith(cells[2])
+        and line[: ends["flips"]].endswith(cells[-4])
+    )
 
 
 def test_a_model_card_tells_what_the_record_does(evaluation):
@@ -579,7 +619,10 @@ def test_a_model_card_tells_what_the_record_does(evaluation):
     lines = card.splitlines()
     assert lines[0] == "# small" and "| trained by | a test |" in lines
     assert "Generated mugs: 2 that no training run saw, 2 transfers of the handle." in lines
-    assert "`tdf evaluate --seed 3 --pairs 2 --inits 2 --iterations 2 --meshes DIR --poses 2 --category mug --clouds full views1 half`" in card
+    assert (
+        "`tdf evaluate --seed 3 --pairs 2 --inits 2 --iterations 2 --meshes DIR --poses 2 --category mug --clouds full views1 half`"
+        in card
+    )
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.count("|") == 11]
     rows = [row for row in rows if row[0] not in ("cloud", "---")]
     assert len(rows) == len(record["rows"]) == 24
@@ -592,7 +635,9 @@ def test_a_model_card_tells_what_the_record_does(evaluation):
 
 def test_pictures_of_an_evaluation(weights, real, tmp_path, monkeypatch):
     drawn, triangle = [], np.array([[[0, 0, 0], [0.05, 0, 0], [0, 0.05, 0.01]]])
-    monkeypatch.setattr("tdf_jax.networks.surface.reconstructed", lambda field, T, bounds: drawn.append(bounds) or triangle)
+    monkeypatch.setattr(
+        "tdf_jax.networks.surface.reconstructed", lambda field, T, bounds: drawn.append(bounds) or triangle
+    )
     monkeypatch.setattr("tdf_jax.cli.evaluate.MOST_GENERATED", 1)
     run("evaluate", "--weights", weights, *EVALUATE, "--meshes", real, "--poses", 2, "--figures", tmp_path / "pictures")
     assert {path.name for path in (tmp_path / "pictures").iterdir()} == {"reconstructions.png", "transfers.png"}
@@ -665,6 +710,16 @@ def test_every_start_non_finite_is_told(refusal, weights, monkeypatch):
 
 
 def test_commands_are_the_functions_of_their_modules():
-    assert set(command_line.COMMANDS) == {"imitate", "landscape", "convert", "evaluate", "benchmark", "shapes", "dataset", "train", "reproduce"}
+    assert set(command_line.COMMANDS) == {
+        "imitate",
+        "landscape",
+        "convert",
+        "evaluate",
+        "benchmark",
+        "shapes",
+        "dataset",
+        "train",
+        "reproduce",
+    }
     for name in command_line.COMMANDS:
         assert callable(getattr(sys.modules[f"tdf_jax.cli.{name}"], name))

@@ -34,11 +34,16 @@ def sweep(weights, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("grid", "pictures"), [("yz", {"map.png"}), ("volume", {"isosurface.png", "slices.gif"}), ("path", {"isosurface.png", "slices.gif"})]
+    ("grid", "pictures"),
+    [("yz", {"map.png"}), ("volume", {"isosurface.png", "slices.gif"}), ("path", {"isosurface.png", "slices.gif"})],
 )
 def test_a_run_writes_every_file_and_nothing_beside_them(weights, tmp_path, grid, pictures):
     run("landscape", "--weights", weights, "--out", tmp_path / "out", "--grid", grid, *QUICK)
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", "landscape.npz", "landscape.html"} | pictures
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "result.json",
+        "landscape.npz",
+        "landscape.html",
+    } | pictures
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     found, about = tdf.load_landscape(tmp_path / "out" / "landscape.npz")
     assert found.values.shape[1:] == found.grid.shape
@@ -57,7 +62,10 @@ def test_the_record_and_the_landscape_agree(sweep):
     assert found.reduce == "soft_least"
     path = np.array(record["path"])
     ends = np.array(record["truth"])[[0, -1]]
-    nearest = [found.grid.points.reshape(-1, 3)[np.linalg.norm(found.grid.points.reshape(-1, 3) - end, axis=1).argmin()] for end in ends]
+    nearest = [
+        found.grid.points.reshape(-1, 3)[np.linalg.norm(found.grid.points.reshape(-1, 3) - end, axis=1).argmin()]
+        for end in ends
+    ]
     np.testing.assert_allclose(path[[0, -1]], nearest, atol=1e-6)
     assert record["query_change"]["largest"] >= record["query_change"]["median"] > 0
     assert record["one_by_one"] == 125 * record["queries"]
@@ -122,7 +130,9 @@ def test_another_sweep_does_not_go_on(sweep, tmp_path, monkeypatch, capsys, chan
         yield next(true_fill(*arguments))
         raise KeyboardInterrupt
 
-    first = ("--grid", "path", "--radius", "0.075") if "--radius" in changed else ("--rotation", "turns", "--rotations", 2)
+    first = (
+        ("--grid", "path", "--radius", "0.075") if "--radius" in changed else ("--rotation", "turns", "--rotations", 2)
+    )
     monkeypatch.setattr(command, "fill", stopping)
     with pytest.raises(SystemExit):
         sweep(*first)
@@ -135,7 +145,10 @@ def test_another_sweep_does_not_go_on(sweep, tmp_path, monkeypatch, capsys, chan
 def test_a_mask_makes_another_sweep(field, reference):
     grid = tdf.plane_grid(0.1, 3)
     masked = dataclasses.replace(grid, mask=np.eye(3, dtype=bool))
-    digests = {command._digest(field, reference, one, np.eye(3)[None]) for one in (grid, masked, dataclasses.replace(masked, mask=~masked.mask))}
+    digests = {
+        command._digest(field, reference, one, np.eye(3)[None])
+        for one in (grid, masked, dataclasses.replace(masked, mask=~masked.mask))
+    }
     assert len(digests) == 3
 
 
@@ -159,7 +172,9 @@ def test_what_fails_after_the_sweep_does_not_lose_it(sweep, tmp_path, monkeypatc
 def test_the_path_is_as_sharp_as_asked_and_left_out_of_large_grids(sweep, monkeypatch):
     asked = []
     true_path = command.lowest_cost_path
-    monkeypatch.setattr(command, "lowest_cost_path", lambda *arguments: (asked.append(arguments[3]), true_path(*arguments))[1])
+    monkeypatch.setattr(
+        command, "lowest_cost_path", lambda *arguments: (asked.append(arguments[3]), true_path(*arguments))[1]
+    )
     sweep("--sharpness", 3)
     assert asked == [3.0]
     monkeypatch.setattr(command, "ROUTED", 24)
@@ -186,7 +201,11 @@ def test_a_long_sweep_is_kept_on_the_way(sweep, tmp_path, monkeypatch):
     monkeypatch.setattr(command, "SAVE_SECONDS", 0.0)
     kept = []
     true_save = command.save_landscape
-    monkeypatch.setattr(command, "save_landscape", lambda path, *rest: (kept.append((path.name, rest[1].get("done"))), true_save(path, *rest)))
+    monkeypatch.setattr(
+        command,
+        "save_landscape",
+        lambda path, *rest: (kept.append((path.name, rest[1].get("done"))), true_save(path, *rest)),
+    )
     sweep("--grid", "volume")
     *parts, last = kept
     assert [done for _, done in parts] == list(range(1, len(parts) + 1))
@@ -196,7 +215,9 @@ def test_a_long_sweep_is_kept_on_the_way(sweep, tmp_path, monkeypatch):
 def test_a_demonstration_and_a_cloud_from_files(weights, tmp_path):
     rng = np.random.default_rng(0)
     path = tdf.line(4, start=(0, 0, 0), end=(0.1, 0, 0))
-    save_demonstration(tmp_path / "demo.npz", tdf.Demonstration(rng.normal(size=(60, 3)) * 0.04, path, rng.normal(size=(9, 3)) * 0.02))
+    save_demonstration(
+        tmp_path / "demo.npz", tdf.Demonstration(rng.normal(size=(60, 3)) * 0.04, path, rng.normal(size=(9, 3)) * 0.02)
+    )
     np.save(tmp_path / "cloud.npy", rng.normal(size=(60, 3)) * 0.04)
     files = ("--demonstration", tmp_path / "demo.npz", "--target", tmp_path / "cloud.npy", "--out", tmp_path / "out")
     run("landscape", "--weights", weights, *files, "--no-plots", "--half", 0.1, "--pitch", 0.05)

@@ -46,7 +46,16 @@ def made(seed, poses=3, best=1):
     """A run of random numbers, two starts."""
     paths = [random_poses(seed + k, poses, reach=0.3) for k in range(6)]
     losses = np.array([[4.0, 3.0, 2.0], [5.0, 2.5, 1.0]])[:: 1 if best else -1] * (1 + seed)
-    return Run(paths[0], paths[1], paths[1][:, 4:], np.stack(paths[2:4]), np.stack(paths[4:6]), losses, np.zeros(2), np.array(0.0))
+    return Run(
+        paths[0],
+        paths[1],
+        paths[1][:, 4:],
+        np.stack(paths[2:4]),
+        np.stack(paths[4:6]),
+        losses,
+        np.zeros(2),
+        np.array(0.0),
+    )
 
 
 def path_of(axes, label):
@@ -58,12 +67,24 @@ def test_figure_1_shows_the_reference_a_start_and_both_results(scene):
     runs = {"l_t": made(0, best=0), "l_t + l_c": made(10)}  # of one start, though l_t alone takes another furthest
     figure = pictures.figure1(runs, scene)
     *panels, bar = figure.axes
-    assert [axes.get_title() for axes in panels] == ["reference", "random start", r"after $l_t$ alone", r"after $l_t + k\,l_c$"]
-    shown = [np.asarray(scene.demonstration.trajectory.wxyz_xyz), runs["l_t + l_c"].starts[1], runs["l_t"].found[1], runs["l_t + l_c"].found[1]]
+    assert [axes.get_title() for axes in panels] == [
+        "reference",
+        "random start",
+        r"after $l_t$ alone",
+        r"after $l_t + k\,l_c$",
+    ]
+    shown = [
+        np.asarray(scene.demonstration.trajectory.wxyz_xyz),
+        runs["l_t + l_c"].starts[1],
+        runs["l_t"].found[1],
+        runs["l_t + l_c"].found[1],
+    ]
     for axes, path in zip(panels, shown):
         np.testing.assert_allclose(path_of(axes, "trajectory of the query frame"), path[:, 4:], atol=1e-6)
     for axes in panels[2:]:
-        np.testing.assert_allclose(path_of(axes, "true trajectory and pick"), runs["l_t + l_c"].expected[:, 4:], atol=1e-6)
+        np.testing.assert_allclose(
+            path_of(axes, "true trajectory and pick"), runs["l_t + l_c"].expected[:, 4:], atol=1e-6
+        )
 
 
 def test_figure_4_shows_test_reference_and_truth_of_six_runs(scene):
@@ -100,9 +121,16 @@ def test_figure_5_shows_the_best_start_and_the_range_over_starts():
 
 
 def test_figure_3_shows_errors_against_distance_and_marks_the_papers():
-    runs = {(k, distance, 0): made(index) for index, (k, distance) in enumerate([(0.02, 0.5), (0.02, 2.0), (0.0, 0.5), (0.0, 2.0)])}
+    runs = {
+        (k, distance, 0): made(index)
+        for index, (k, distance) in enumerate([(0.02, 0.5), (0.02, 2.0), (0.0, 0.5), (0.0, 2.0)])
+    }
     panels = pictures.figure3(runs).axes
-    values = [lambda run: 100 * run.pick_error[0], lambda run: np.degrees(run.pick_error[1]), lambda run: 100 * run.waypoint_error[0]]
+    values = [
+        lambda run: 100 * run.pick_error[0],
+        lambda run: np.degrees(run.pick_error[1]),
+        lambda run: 100 * run.waypoint_error[0],
+    ]
     for axes, value in zip(panels, values, strict=True):
         drawn = {line.get_label(): line for line in axes.lines if line.get_label().startswith("k")}
         for k in (0.02, 0.0):
@@ -164,7 +192,19 @@ def test_a_second_call_computes_nothing(everything, weights, monkeypatch, capsys
 
 
 def test_one_parameter_can_be_changed(weights, tmp_path):
-    main(["reproduce", "fig1", "--out", str(tmp_path / "out"), "--weights", weights, *WORDS, "--pose-norm", "mean_absolute"])
+    main(
+        [
+            "reproduce",
+            "fig1",
+            "--out",
+            str(tmp_path / "out"),
+            "--weights",
+            weights,
+            *WORDS,
+            "--pose-norm",
+            "mean_absolute",
+        ]
+    )
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"fig1.png", "runs"}
 
 

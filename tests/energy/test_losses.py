@@ -149,7 +149,9 @@ def test_the_energy_takes_either_order_of_equation_6(field, reference, current):
     found = {}
     for order in ("frobenius", "infinity"):
         weights = tdf.EnergyWeights(0.0, 0.3, compensator_order=order)
-        rest = tdf.trajectory_energy(current, field, reference, weights) - tdf.descriptor_loss(current, field, reference)
+        rest = tdf.trajectory_energy(current, field, reference, weights) - tdf.descriptor_loss(
+            current, field, reference
+        )
         np.testing.assert_allclose(rest, 0.3 * tdf.compensator_loss(current, order), rtol=1e-4)
         found[order] = float(rest)
     assert found["infinity"] < found["frobenius"]

@@ -57,7 +57,9 @@ def test_several_demonstrations_give_the_median_if_asked(small_model, demonstrat
     mean = tdf.describe(small_model, [demonstration, other, third])
     sums = [sum(np.abs(one.descriptors - centre.descriptors).sum() for one in alone) for centre in (found, mean)]
     assert sums[0] < 0.999 * sums[1]
-    np.testing.assert_array_equal(tdf.describe(small_model, demonstration, combine="median").descriptors, reference.descriptors)
+    np.testing.assert_array_equal(
+        tdf.describe(small_model, demonstration, combine="median").descriptors, reference.descriptors
+    )
 
 
 def test_an_unknown_combination_is_refused(small_model, demonstration):

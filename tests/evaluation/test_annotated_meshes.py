@@ -24,9 +24,16 @@ ENTRY = {"unit": 1, "up": "+z", "handle": "+x"}
 BOWL = {"category": "bowl", "unit": 1, "up": "+z", "symmetry": "round"}
 BOTTLE = {"category": "bottle", "unit": 1, "up": "+z", "symmetry": "two-fold", "front": "+x"}
 FLAT = BottleParameters(aspect=0.7)
-DEFAULTS = {"mug": {"none": build_mug}, "bowl": {"round": build_bowl, "two-fold": lambda: build_bowl(BowlParameters(aspect=0.7))},
-            "bottle": {"round": build_bottle, "two-fold": lambda: build_bottle(FLAT), "four-fold": lambda: build_bottle(BottleParameters(squareness=5.0)),
-                       "none": lambda: build_bottle(BottleParameters(handle=True))}}
+DEFAULTS = {
+    "mug": {"none": build_mug},
+    "bowl": {"round": build_bowl, "two-fold": lambda: build_bowl(BowlParameters(aspect=0.7))},
+    "bottle": {
+        "round": build_bottle,
+        "two-fold": lambda: build_bottle(FLAT),
+        "four-fold": lambda: build_bottle(BottleParameters(squareness=5.0)),
+        "none": lambda: build_bottle(BottleParameters(handle=True)),
+    },
+}
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +45,10 @@ def mugs():
 def sampled():
     """Bowls and bottles of several seeds, by category, some of every fold."""
     families = {name: FAMILIES[name] for name in ("bowl", "bottle")}
-    return {name: [family.build(family.sample(np.random.default_rng([14, seed]))) for seed in range(16)] for name, family in families.items()}
+    return {
+        name: [family.build(family.sample(np.random.default_rng([14, seed]))) for seed in range(16)]
+        for name, family in families.items()
+    }
 
 
 def places_of(mesh, shape):
@@ -166,7 +176,9 @@ def test_a_missing_sector_is_no_hindrance(sampled):
     for shape in [next(shape for shape in sampled[category] if shape.fold == 0) for category in ("bowl", "bottle")]:
         x, y, _ = shape.mesh.triangles_center.T
         aside = np.abs(np.degrees(np.arctan2(y, x)) - 45)
-        cut, large = (trimesh.Trimesh(shape.mesh.vertices, shape.mesh.faces[aside > half], process=False) for half in (10, 60))
+        cut, large = (
+            trimesh.Trimesh(shape.mesh.vertices, shape.mesh.faces[aside > half], process=False) for half in (10, 60)
+        )
         _, places = places_of(cut, shape)
         for name, T in places_of(shape.mesh, shape)[1].items():
             np.testing.assert_allclose(places[name], T, atol=1e-3)
@@ -205,7 +217,9 @@ def test_a_pouring_lip_does_not_move_the_axis_of_a_bowl():
 
 
 @pytest.mark.parametrize("angle", [-35.0, 35.0])
-@pytest.mark.parametrize(("category", "symmetry"), [("bowl", "two-fold"), ("bottle", "two-fold"), ("bottle", "four-fold")])
+@pytest.mark.parametrize(
+    ("category", "symmetry"), [("bowl", "two-fold"), ("bottle", "two-fold"), ("bottle", "four-fold")]
+)
 def test_a_turned_side_is_measured(category, symmetry, angle):
     shape = DEFAULTS[category][symmetry]()
     found = profile(turned(shape.mesh, angle), category, shape.fold, category)
@@ -247,12 +261,21 @@ def test_files_of_any_unit_and_axes_come_into_the_canonical_frame(folder, up, ha
 
 
 @pytest.mark.parametrize(("up", "front", "unit"), [("+z", "+x", 1), ("-y", "+z", 0.01), ("+x", "-y", 0.001)])
-@pytest.mark.parametrize(("category", "symmetry"), [(category, name) for category in ("bowl", "bottle") for name in DEFAULTS[category]])
+@pytest.mark.parametrize(
+    ("category", "symmetry"), [(category, name) for category in ("bowl", "bottle") for name in DEFAULTS[category]]
+)
 def test_bowl_and_bottle_files_come_into_the_canonical_frame(folder, category, symmetry, up, front, unit):
     shape = DEFAULTS[category][symmetry]()
     given = np.eye(4)
     given[:3, 3] = 0.01, 0.02, 0.03
-    entry = {"category": category, "unit": unit, "up": up, "symmetry": symmetry, "front": front, "places": {"base": given.tolist()}}
+    entry = {
+        "category": category,
+        "unit": unit,
+        "up": up,
+        "symmetry": symmetry,
+        "front": front,
+        "places": {"base": given.tolist()},
+    }
     (found,) = load_annotated(folder({"my.stl": in_file(shape.mesh, up, front, unit)}, {"my.stl": entry}))
     assert (found.name, found.category, found.fold) == ("my", category, shape.fold) and FOLDS[found.fold] == symmetry
     assert found.height == pytest.approx(shape.height, abs=1e-5)
@@ -266,7 +289,9 @@ def test_bowl_and_bottle_files_come_into_the_canonical_frame(folder, category, s
 @pytest.mark.parametrize("up", ["+x", "-y", "+z"])
 def test_round_objects_need_no_front(folder, up):
     front = next(axis for axis in ("+x", "+y") if axis[1] != up[1])
-    (found,) = load_annotated(folder({"bowl.obj": in_file(build_bowl().mesh, up, front, 1)}, {"bowl.obj": BOWL | {"up": up}}))
+    (found,) = load_annotated(
+        folder({"bowl.obj": in_file(build_bowl().mesh, up, front, 1)}, {"bowl.obj": BOWL | {"up": up}})
+    )
     for name, T in found.frames.items():
         np.testing.assert_allclose(T, build_bowl().frames[name], atol=1e-3)
 
@@ -274,22 +299,36 @@ def test_round_objects_need_no_front(folder, up):
 def test_a_front_may_be_a_direction_and_must_be_that_of_the_longer_side(folder):
     bottle = build_bottle(FLAT)
     meshes = {"my.obj": turned(bottle.mesh, -23.0)}
-    with pytest.raises(InputError, match=r'my.obj has its longer side 23 degrees from \'front\'; .*"front": \[0.92., -0.39., 0.000\]') as refused:
+    with pytest.raises(
+        InputError, match=r'my.obj has its longer side 23 degrees from \'front\'; .*"front": \[0.92., -0.39., 0.000\]'
+    ) as refused:
         load_annotated(folder(meshes, {"my.obj": BOTTLE}))
     hint = json.loads(re.search(r"\[.*\]", str(refused.value))[0])
     for front in (hint, [200 * number for number in hint]):
         (found,) = load_annotated(folder(meshes, {"my.obj": BOTTLE | {"front": front}}))
         np.testing.assert_allclose(found.mesh.bounds, bottle.mesh.bounds, atol=1e-3)
     with pytest.raises(InputError, match=r"my.obj has its flat side 23 degrees"):
-        load_annotated(folder({"my.obj": turned(DEFAULTS["bottle"]["four-fold"]().mesh, 23.0)}, {"my.obj": BOTTLE | {"symmetry": "four-fold"}}))
+        load_annotated(
+            folder(
+                {"my.obj": turned(DEFAULTS["bottle"]["four-fold"]().mesh, 23.0)},
+                {"my.obj": BOTTLE | {"symmetry": "four-fold"}},
+            )
+        )
 
 
-@pytest.mark.parametrize(("symmetry", "mesh", "message"), [
-    ("round", FLAT, "my.obj is not round: a turn of 90 degrees .*'symmetry'"),
-    ("round", BottleParameters(squareness=5.0), "my.obj is not round: a turn of 45 degrees"),
-    ("four-fold", FLAT, "my.obj is not four-fold: a turn of 90 degrees"),
-    ("none", BottleParameters(handle=True), "my.obj reaches 3.6 cm from its axis to its front and 7.4 cm to another side.*'front'"),
-])
+@pytest.mark.parametrize(
+    ("symmetry", "mesh", "message"),
+    [
+        ("round", FLAT, "my.obj is not round: a turn of 90 degrees .*'symmetry'"),
+        ("round", BottleParameters(squareness=5.0), "my.obj is not round: a turn of 45 degrees"),
+        ("four-fold", FLAT, "my.obj is not four-fold: a turn of 90 degrees"),
+        (
+            "none",
+            BottleParameters(handle=True),
+            "my.obj reaches 3.6 cm from its axis to its front and 7.4 cm to another side.*'front'",
+        ),
+    ],
+)
 def test_another_symmetry_than_the_mesh_has_is_noticed(folder, symmetry, mesh, message):
     entry = BOTTLE | {"symmetry": symmetry, "front": "+y" if symmetry == "none" else "+x"}
     with pytest.raises(InputError, match=message):
@@ -299,10 +338,14 @@ def test_another_symmetry_than_the_mesh_has_is_noticed(folder, symmetry, mesh, m
 def test_places_that_cannot_be_measured_may_be_given(folder):
     """A can has no neck, a bowl under its lid no rim."""
     can = trimesh.creation.cylinder(0.03, 0.12, sections=64).subdivide()
-    lid = trimesh.creation.cylinder(0.076, 0.004, transform=trimesh.transformations.translation_matrix([0, 0, 0.03]), sections=64)
+    lid = trimesh.creation.cylinder(
+        0.076, 0.004, transform=trimesh.transformations.translation_matrix([0, 0, 0.03]), sections=64
+    )
     meshes = {"can.obj": can, "pot.obj": trimesh.util.concatenate([build_bowl().mesh, lid])}
     entries = {"can.obj": BOWL | {"category": "bottle"}, "pot.obj": BOWL}
-    with pytest.raises(InputError, match="can.obj cannot be measured: nothing above its body is narrow enough .*'places'"):
+    with pytest.raises(
+        InputError, match="can.obj cannot be measured: nothing above its body is narrow enough .*'places'"
+    ):
         load_annotated(folder(meshes, entries))
     neck, rim = np.eye(4), np.eye(4)
     neck[2, 3], rim[0, 3] = 0.04, 0.07
@@ -333,7 +376,10 @@ BAD_SIDECARS = {
     "nothing": ({}, "holds no entry"),
     "another mesh": ({"cup.obj": ENTRY}, "no entry for mug.obj"),
     "a missing mesh": ({"mug.obj": ENTRY, "cup.obj": ENTRY}, "there is no file .*cup.obj"),
-    "a missing key": ({"mug.obj": {"unit": 1, "up": "+z"}}, "mug.obj: the entry has the keys unit, up; expected unit, up, handle"),
+    "a missing key": (
+        {"mug.obj": {"unit": 1, "up": "+z"}},
+        "mug.obj: the entry has the keys unit, up; expected unit, up, handle",
+    ),
     "a misspelt key": ({"mug.obj": ENTRY | {"place": {}}}, "mug.obj: .*place; expected"),
     "an entry that is none": ({"mug.obj": 1}, "mug.obj: the entry has a JSON int"),
     "an unknown axis": ({"mug.obj": ENTRY | {"up": "z"}}, r"up is 'z'; expected one of \+x, -x"),
@@ -342,28 +388,49 @@ BAD_SIDECARS = {
     "unit zero": ({"mug.obj": ENTRY | {"unit": 0}}, "unit is 0; expected metres per unit"),
     "unit in words": ({"mug.obj": ENTRY | {"unit": "cm"}}, "unit is 'cm'"),
     "unit NaN": ('{"mug.obj": {"unit": NaN, "up": "+z", "handle": "+x"}}', "unit is nan"),
-    "unit too large": ({"mug.obj": ENTRY | {"unit": 100}}, r"mug.obj has a diagonal of 1[0-9.]+ m with unit 100; .*try 1"),
+    "unit too large": (
+        {"mug.obj": ENTRY | {"unit": 100}},
+        r"mug.obj has a diagonal of 1[0-9.]+ m with unit 100; .*try 1",
+    ),
     "unit too small": ({"mug.obj": ENTRY | {"unit": 0.01}}, r"diagonal of 0.001[0-9]+ m with unit 0.01; .*try 1"),
     "an unknown place": ({"mug.obj": ENTRY | {"places": {"spout": []}}}, "places is .*spout.*handle, rim, base"),
     "a place of another shape": (place([[1, 0], [0, 1]]), r"the place handle has shape \(2, 2\)"),
     "a ragged place": (place([[1, 0], [0]]), "the place handle is no matrix"),
     "a place that is no motion": (place(np.diag([1, 1, -1, 1]).tolist()), "the place handle is no rigid motion"),
-    "an unknown category": ({"mug.obj": ENTRY | {"category": "cup"}}, "category is 'cup'; expected one of mug, bowl, bottle"),
+    "an unknown category": (
+        {"mug.obj": ENTRY | {"category": "cup"}},
+        "category is 'cup'; expected one of mug, bowl, bottle",
+    ),
     "a category that is no name": ({"mug.obj": ENTRY | {"category": ["mug"]}}, r"category is \['mug'\]"),
     "a mug's symmetry": ({"mug.obj": ENTRY | {"symmetry": "none"}}, "the keys .*symmetry; expected unit, up, handle"),
     "a bowl's handle": ({"mug.obj": ENTRY | BOWL}, "the keys .*handle.*; expected category, unit, up, symmetry and"),
-    "a bowl without symmetry": ({"mug.obj": {"category": "bowl", "unit": 1, "up": "+z"}}, "the keys category, unit, up; expected category, unit, up, symmetry"),
-    "an oval bowl without front": ({"mug.obj": BOWL | {"symmetry": "two-fold"}}, "expected category, unit, up, symmetry, front"),
-    "an unknown symmetry": ({"mug.obj": BOTTLE | {"symmetry": "oval"}}, "symmetry is 'oval'; expected one of round, none, two-fold, four-fold"),
+    "a bowl without symmetry": (
+        {"mug.obj": {"category": "bowl", "unit": 1, "up": "+z"}},
+        "the keys category, unit, up; expected category, unit, up, symmetry",
+    ),
+    "an oval bowl without front": (
+        {"mug.obj": BOWL | {"symmetry": "two-fold"}},
+        "expected category, unit, up, symmetry, front",
+    ),
+    "an unknown symmetry": (
+        {"mug.obj": BOTTLE | {"symmetry": "oval"}},
+        "symmetry is 'oval'; expected one of round, none, two-fold, four-fold",
+    ),
     "a symmetry that is no name": ({"mug.obj": BOTTLE | {"symmetry": [2]}}, r"symmetry is \[2\]"),
     "an unknown front": ({"mug.obj": BOTTLE | {"front": "x"}}, r"front is 'x'; expected one of \+x, .*direction"),
     "a round bowl's unknown front": ({"mug.obj": BOWL | {"front": "x"}}, "front is 'x'"),
     "a parallel front": ({"mug.obj": BOTTLE | {"front": "-z"}}, r"up is \+z and front -z, which are parallel"),
-    "a direction along up": ({"mug.obj": BOTTLE | {"front": [0.7, 0, 0.7]}}, r"front is \[0.7, 0, 0.7\]; .*across up, which is \+z"),
+    "a direction along up": (
+        {"mug.obj": BOTTLE | {"front": [0.7, 0, 0.7]}},
+        r"front is \[0.7, 0, 0.7\]; .*across up, which is \+z",
+    ),
     "a direction of nothing": ({"mug.obj": BOTTLE | {"front": [0, 0, 0]}}, r"front is \[0, 0, 0\]"),
     "a direction of words": ({"mug.obj": BOTTLE | {"front": ["a", 0, 0]}}, r"front is \['a', 0, 0\]"),
     "a mug's direction": ({"mug.obj": ENTRY | {"handle": [1, 0, 0]}}, r"handle is \[1, 0, 0\]; expected one of"),
-    "a mug's place on a bowl": ({"mug.obj": BOWL | {"places": {"handle": np.eye(4).tolist()}}}, "places is .*handle.*any of rim, base, body"),
+    "a mug's place on a bowl": (
+        {"mug.obj": BOWL | {"places": {"handle": np.eye(4).tolist()}}},
+        "places is .*handle.*any of rim, base, body",
+    ),
 }
 
 
@@ -387,7 +454,9 @@ def test_bad_folders(tmp_path):
         load_annotated(tmp_path)
 
 
-@pytest.mark.parametrize(("grip", "message"), [("solid", "no handle with a finger hole"), ("open", "its handle is open half way")])
+@pytest.mark.parametrize(
+    ("grip", "message"), [("solid", "no handle with a finger hole"), ("open", "its handle is open half way")]
+)
 def test_a_handle_that_is_given_need_not_be_measurable(folder, grip, message):
     """One handle is a block, of the other only the ends are left."""
     mug = build_mug()
@@ -405,7 +474,9 @@ def test_a_handle_that_is_given_need_not_be_measurable(folder, grip, message):
 
 def test_names_are_told_apart(folder):
     with pytest.raises(InputError, match="several meshes called mug"):
-        load_annotated(folder({"mug.obj": build_mug().mesh, "mug.stl": build_mug().mesh}, {"mug.obj": ENTRY, "mug.stl": ENTRY}))
+        load_annotated(
+            folder({"mug.obj": build_mug().mesh, "mug.stl": build_mug().mesh}, {"mug.obj": ENTRY, "mug.stl": ENTRY})
+        )
 
 
 @pytest.mark.skipif(not DOCS.exists(), reason="the documentation is not part of a source archive")
@@ -414,7 +485,11 @@ def test_the_documented_sidecar_is_read(folder):
     meshes, shapes = {}, {}
     for name, entry in json.loads(entries).items():
         shapes[Path(name).stem] = shape = DEFAULTS[entry.get("category", "mug")][entry.get("symmetry", "none")]()
-        front = entry.get("handle") or entry.get("front") or next(axis for axis in ("+x", "+y") if axis[1] != entry["up"][1])
+        front = (
+            entry.get("handle")
+            or entry.get("front")
+            or next(axis for axis in ("+x", "+y") if axis[1] != entry["up"][1])
+        )
         meshes[name] = in_file(shape.mesh, entry["up"], front, entry["unit"])
     for found in load_annotated(folder(meshes, entries)):
         for name, T in shapes[found.name].frames.items():

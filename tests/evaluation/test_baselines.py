@@ -88,13 +88,17 @@ def test_the_place_is_carried_with_the_object(monkeypatch, method):
     T_b_a = case.T_world_place_b @ np.linalg.inv(case.T_world_place_a)
     monkeypatch.setattr("tdf_jax.evaluation.baselines.principal_axes", lambda a, b: T_b_a)
     seen = []
-    monkeypatch.setattr("tdf_jax.evaluation.baselines.iterative_closest_points", lambda a, b, rotations: seen.append(rotations) or T_b_a)
+    monkeypatch.setattr(
+        "tdf_jax.evaluation.baselines.iterative_closest_points", lambda a, b, rotations: seen.append(rotations) or T_b_a
+    )
     found = aligned(method, [case, case], seed=3, inits=4, progress=False)
     distance, angle = place_errors(found, [case, case])
     assert distance.max() < 1e-6 and angle.max() < 0.1
     if method == "ICP":
         assert len(seen[0]) == 4 and np.abs(seen[0] - seen[1]).max() > 0.1
-        turns = poses.rotation_distance(jax.numpy.asarray(seen[0], "float32"), jax.numpy.asarray(case.T_world_b[:3, :3], "float32"))
+        turns = poses.rotation_distance(
+            jax.numpy.asarray(seen[0], "float32"), jax.numpy.asarray(case.T_world_b[:3, :3], "float32")
+        )
         assert turns.min() > 0.01  # no start is the answer
 
 

@@ -99,7 +99,12 @@ def test_errors_are_from_the_nearest_of_the_poses_that_a_symmetry_makes_equal(bo
     case = dataclasses.replace(case, T_world_place_b=case.T_world_b @ local)
     for degrees in (0, 45, 90, 180, 200):
         distance, angle = place_errors(pose_of(case.T_world_b @ about_z(np.radians(degrees)) @ local)[None], [case])
-        off = {0: 0, 1: min(degrees, 360 - degrees), 2: min(degrees % 180, 180 - degrees % 180), 4: min(degrees % 90, 90 - degrees % 90)}[fold]
+        off = {
+            0: 0,
+            1: min(degrees, 360 - degrees),
+            2: min(degrees % 180, 180 - degrees % 180),
+            4: min(degrees % 90, 90 - degrees % 90),
+        }[fold]
         assert angle[0] == pytest.approx(off, abs=0.1)
         assert distance[0] == pytest.approx(2 * 0.03 * np.sin(np.radians(off) / 2), abs=1e-5)
 
@@ -171,7 +176,9 @@ def test_a_scene_begins_at_the_categorys_place_and_ends_on_a_shelf(category):
     pick = pose_of(equal @ np.linalg.inv(made.T_world_places[0]) @ ends[0])
     goal = np.asarray(made.demonstration.trajectory.wxyz_xyz[-1])
     expected = made.expected(goal, pick)
-    np.testing.assert_allclose(np.asarray(expected.matrices[0]), np.asarray(tdf.Trajectory(pick[None]).matrices[0]), atol=1e-5)
+    np.testing.assert_allclose(
+        np.asarray(expected.matrices[0]), np.asarray(tdf.Trajectory(pick[None]).matrices[0]), atol=1e-5
+    )
     np.testing.assert_allclose(np.abs(expected.wxyz_xyz[-1]), np.abs(goal), atol=1e-5)
 
 
@@ -193,13 +200,29 @@ def real(tmp_path_factory):
     """A folder of a bowl."""
     folder = tmp_path_factory.mktemp("real")
     tdf.build_bowl().mesh.export(folder / "dish.obj")
-    (folder / "meshes.json").write_text(json.dumps({"dish.obj": {"category": "bowl", "unit": 1, "up": "+z", "symmetry": "round"}}))
+    (folder / "meshes.json").write_text(
+        json.dumps({"dish.obj": {"category": "bowl", "unit": 1, "up": "+z", "symmetry": "round"}})
+    )
     return folder
 
 
 def test_categories_are_evaluated_one_after_the_other(weights, real, tmp_path, capsys):
     words = ("--pairs", 1, "--inits", 2, "--iterations", 2, "--poses", 1)
-    run("evaluate", "--weights", weights, "--category", "bowl", "bottle", *words, "--meshes", real, "--json", tmp_path / "scores.json", "--card", tmp_path / "card.md")
+    run(
+        "evaluate",
+        "--weights",
+        weights,
+        "--category",
+        "bowl",
+        "bottle",
+        *words,
+        "--meshes",
+        real,
+        "--json",
+        tmp_path / "scores.json",
+        "--card",
+        tmp_path / "card.md",
+    )
     record = json.loads((tmp_path / "scores.json").read_text())
     assert [row["set"] for row in record["rows"]] == ["generated bowls", "real bowls", "generated bottles"]
     assert [row["errors"][0]["object"] for row in record["rows"]] == ["bowl 0", "dish", "bottle 0"]
@@ -213,7 +236,13 @@ def test_categories_are_evaluated_one_after_the_other(weights, real, tmp_path, c
 def test_a_summary_tells_symmetries_apart(bottles):
     cases = [bottles[0], bottles[2], bottles[0], bottles[4]]
     ious = {"iou": [0.9, 0.5, 0.7, None], "iou_refined": [0.8, 0.6, 0.8, None]}
-    row = summary(np.array([0.001, 0.03, 0.015, 0.001]), np.array([1.0, 1.0, 1.0, 30.0]), ious, cases, tilt=np.array([1.0, 1.0, 21.0, 2.0]))
+    row = summary(
+        np.array([0.001, 0.03, 0.015, 0.001]),
+        np.array([1.0, 1.0, 1.0, 30.0]),
+        ious,
+        cases,
+        tilt=np.array([1.0, 1.0, 21.0, 2.0]),
+    )
     assert list(row["by_symmetry"]) == ["round", "two-fold", "four-fold"]
     assert row["by_symmetry"]["round"] == {
         "cases": 2, "iou": pytest.approx(0.8), "iou_refined": pytest.approx(0.8),

@@ -106,7 +106,9 @@ def carried_last(task):
 def test_24_tasks_are_every_path_with_every_goal_and_six_are_every_path(case):
     kinds = [(task.path, task.displacement) for task in (make_task(case, 0, index) for index in range(24))]
     assert set(kinds) == {(path, displacement) for path in PATHS for displacement in DISPLACEMENTS}
-    assert [path for path, _ in kinds[:6]] == list(PATHS) and {displacement for _, displacement in kinds[:6]} == {"none"}
+    assert [path for path, _ in kinds[:6]] == list(PATHS) and {displacement for _, displacement in kinds[:6]} == {
+        "none"
+    }
     again = make_task(case, 0, 24 + 7)
     assert (again.path, again.displacement) == kinds[7]
 
@@ -197,7 +199,9 @@ def test_tasks_on_real_meshes_are_of_all_paths_and_goals_and_apart_from_the_othe
         assert len(set(indices)) == 120 and min(indices) > 10**6
         tasks = [make_task(case, 0, index) for index in indices[:24]]
         assert len({(one.path, one.displacement) for one in tasks}) == 24
-        assert {one.path for one in tasks[:6]} == set(PATHS) and {one.displacement for one in tasks[:4]} == set(DISPLACEMENTS)
+        assert {one.path for one in tasks[:6]} == set(PATHS) and {one.displacement for one in tasks[:4]} == set(
+            DISPLACEMENTS
+        )
     assert not {mesh_index("cup", pose) for pose in range(120)} & {mesh_index("mug", pose) for pose in range(120)}
 
 
@@ -249,7 +253,9 @@ def test_every_attempt_is_finite_and_ends_at_the_goal(attempts, task, method):
         assert_same_poses(row[-1], task.goal)
         np.testing.assert_allclose(np.linalg.norm(row[:, :4], axis=1), 1, atol=1e-5)
     assert found.scores[found.best] == found.scores.min()
-    assert np.isfinite(found.seconds) and (found.seconds > 0) == (method not in ("copy", "centroids", "oracle correspondences"))
+    assert np.isfinite(found.seconds) and (found.seconds > 0) == (
+        method not in ("copy", "centroids", "oracle correspondences")
+    )
 
 
 def test_only_the_library_tells_a_residual(attempts, encoded):
@@ -291,7 +297,9 @@ def test_picks_are_scored_by_their_descriptors(attempts, encoded, values, method
     for row, found in zip(attempts[method].trajectories, attempts[method].scores):
         points = Rotation.from_quat(row[0, :4], scalar_first=True).apply(np.asarray(reference.query)) + row[0, 4:]
         descriptors, _ = values(field, jnp.asarray(points, jnp.float32))
-        assert found == pytest.approx(np.mean(np.abs(np.asarray(descriptors) - reference.descriptors[0])), rel=0.02, abs=2e-6)
+        assert found == pytest.approx(
+            np.mean(np.abs(np.asarray(descriptors) - reference.descriptors[0])), rel=0.02, abs=2e-6
+        )
 
 
 @pytest.mark.parametrize("method", ENERGIES)
@@ -301,8 +309,12 @@ def test_the_papers_methods_minimise_the_energy_they_are_called_after(attempts, 
         assert found == pytest.approx(float(energy(Trajectory(jnp.asarray(row)), *encoded, ENERGIES[method])), rel=1e-3)
 
 
-@pytest.mark.parametrize(("method", "k"), [("TDF about the carried path, k = 0.02", 0.02), ("TDF about the carried path, k = 0.2", 0.2)])
-def test_the_papers_energy_about_the_carried_path_is_that_of_a_demonstration_already_carried(attempts, encoded, method, k):
+@pytest.mark.parametrize(
+    ("method", "k"), [("TDF about the carried path, k = 0.02", 0.02), ("TDF about the carried path, k = 0.2", 0.2)]
+)
+def test_the_papers_energy_about_the_carried_path_is_that_of_a_demonstration_already_carried(
+    attempts, encoded, method, k
+):
     field, reference = encoded
     carried = jnp.asarray(attempts["tdf_jax"].trajectories[attempts["tdf_jax"].best])
     about = dataclasses.replace(reference, trajectory=Trajectory(carried).shifted(-field.origin))
@@ -313,14 +325,20 @@ def test_the_papers_energy_about_the_carried_path_is_that_of_a_demonstration_alr
 
 
 def test_every_fifth_of_120_tasks_is_every_path_with_every_goal(case):
-    kinds = {(one.path, one.displacement) for one in (make_task(case, 0, index) for index in range(120) if methods.tried("random weights", index))}
+    kinds = {
+        (one.path, one.displacement)
+        for one in (make_task(case, 0, index) for index in range(120) if methods.tried("random weights", index))
+    }
     assert len(kinds) == 24
 
 
 def test_main_methods_are_tried_on_every_task_and_variants_on_every_fifth():
     always = {name for name in METHODS if all(methods.tried(name, index) for index in range(25))}
     assert always == {"copy", "centroids", "PCA", "ICP", *NDF, "TDF, k = 0.02", "tdf_jax", "oracle correspondences"}
-    assert all([index for index in range(25) if methods.tried(name, index)] == [0, 5, 10, 15, 20] for name in set(METHODS) - always)
+    assert all(
+        [index for index in range(25) if methods.tried(name, index)] == [0, 5, 10, 15, 20]
+        for name in set(METHODS) - always
+    )
 
 
 @pytest.mark.parametrize("method", ["ICP", "ICP, 64 starts"])
@@ -331,7 +349,9 @@ def test_icp_is_scored_by_its_mean_squared_distance(attempts, task, method):
         assert found == pytest.approx(np.mean(cKDTree(task.case.points_a.astype(float)).query(moved)[0] ** 2), rel=1e-2)
 
 
-@pytest.mark.parametrize("names", [("NDF pick, carried",), ("tdf_jax", "ICP", "NDF pick, carried", "TDF, k = 0.2", "NDF pick, rigid replay")])
+@pytest.mark.parametrize(
+    "names", [("NDF pick, carried",), ("tdf_jax", "ICP", "NDF pick, carried", "TDF, k = 0.2", "NDF pick, rigid replay")]
+)
 def test_attempts_do_not_depend_on_the_others_nor_on_their_order(attempts, task, model, names):
     one = Attempts(task, model, KEY, INITS)
     for name in names:
@@ -365,7 +385,11 @@ def twins(task):
     case = task.case
     T = case.T_world_b
     moved = (case.points_a.astype(float) @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
-    return make_task(dataclasses.replace(case, object_b=case.object_a, points_b=moved, T_world_place_b=T @ case.T_world_place_a), SEED, 8)
+    return make_task(
+        dataclasses.replace(case, object_b=case.object_a, points_b=moved, T_world_place_b=T @ case.T_world_place_a),
+        SEED,
+        8,
+    )
 
 
 def test_the_oracle_is_exact_on_the_same_mug(twins, model):
@@ -409,7 +433,13 @@ def test_a_start_that_is_not_finite_is_never_chosen():
     lost = np.zeros((5, 7, 7))
     lost[4, 3, 2] = np.nan
     assert Attempt(lost, np.array([3.0, np.nan, 1.0, -np.inf, 0.5]), 0.0).best == 2
-    assert Attempt(lost, np.array([3.0, np.nan, 1.0, -np.inf, 0.5]), 0.0).finite.tolist() == [True, False, True, False, False]
+    assert Attempt(lost, np.array([3.0, np.nan, 1.0, -np.inf, 0.5]), 0.0).finite.tolist() == [
+        True,
+        False,
+        True,
+        False,
+        False,
+    ]
 
 
 # ---- landmarks ----
@@ -418,13 +448,22 @@ def test_a_start_that_is_not_finite_is_never_chosen():
 def distances_to(mesh, points):
     """To the nearest of the mesh's triangles, by libigl."""
     igl = pytest.importorskip("igl")
-    return np.sqrt(igl.point_mesh_squared_distance(np.asarray(points, float), np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64))[0])
+    return np.sqrt(
+        igl.point_mesh_squared_distance(
+            np.asarray(points, float), np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
+        )[0]
+    )
 
 
 @pytest.fixture(scope="module")
 def plain():
     """Mugs without flare, foot or roundings to speak of: round, square, tapered, barrel, with every handle."""
-    shapes = [{}, {"squareness": 6.0, "handle_squareness": 5.0}, {"top_radius": 0.045, "bottom_radius": 0.034}, {"bulge": 0.006}]
+    shapes = [
+        {},
+        {"squareness": 6.0, "handle_squareness": 5.0},
+        {"top_radius": 0.045, "bottom_radius": 0.034},
+        {"bulge": 0.006},
+    ]
     return [
         build_mug(MugParameters(handle_flare=1.0, edge_radius=0.002, lip_radius=0.001, handle_style=style, **shape))
         for shape, style in zip(shapes, HANDLE_STYLES, strict=True)
@@ -454,7 +493,9 @@ def test_landmarks_of_the_wall_lie_on_it(plain):
 def test_landmarks_of_the_handle_lie_on_it(plain):
     for mug in plain:
         handle = mug.landmarks()[:WALL]
-        outside = np.linalg.norm(handle[:, :2], axis=1) > max(mug.parameters.top_radius, mug.parameters.bottom_radius) + 0.009
+        outside = (
+            np.linalg.norm(handle[:, :2], axis=1) > max(mug.parameters.top_radius, mug.parameters.bottom_radius) + 0.009
+        )
         assert outside.sum() > 40
         assert distances_to(mug.mesh, handle[outside]).max() < 1e-3
 
@@ -479,7 +520,9 @@ def test_landmarks_of_the_handle_are_its_four_sides_in_order(plain):
 def test_landmarks_correspond_by_angle_and_share_of_the_height(plain):
     for mug in plain:
         wall = mug.landmarks()[WALL:].reshape(16, 32, 3)
-        np.testing.assert_allclose(wall[..., 2], np.tile(np.linspace(-0.5, 0.5, 16)[:, None] * mug.parameters.height, 32), atol=1e-12)
+        np.testing.assert_allclose(
+            wall[..., 2], np.tile(np.linspace(-0.5, 0.5, 16)[:, None] * mug.parameters.height, 32), atol=1e-12
+        )
         angles = np.degrees(np.arctan2(wall[..., 1], wall[..., 0])) % 360
         turned = (angles - np.arange(32) * 11.25 + 180) % 360 - 180
         assert np.abs(turned).max() < 1e-6
@@ -510,7 +553,13 @@ def test_the_truth_has_no_errors(task):
     assert max(found.distances) == 0 and max(found.angles) < 0.1 and len(found.distances) == len(found.angles) == 7
     assert found.best_pick[0] == found.best_path == found.path_error == found.frechet == found.penetration == 0
     assert found.jerk == pytest.approx(1) and found.longest_step == found.expected_step
-    assert (found.method, found.task, found.instance, found.path, found.displacement) == ("copy", 8, "mug 1", "wave", "10 cm")
+    assert (found.method, found.task, found.instance, found.path, found.displacement) == (
+        "copy",
+        8,
+        "mug 1",
+        "wave",
+        "10 cm",
+    )
     assert (found.clouds, found.starts, found.seconds, found.confidence) == ("full", 1, 1.5, tdf.confidence(0.6))
 
 
@@ -564,7 +613,9 @@ def test_open_meshes_have_no_penetration_wherever_a_path_is(task, metres):
     pytest.importorskip("igl")
     mesh = task.case.object_b.mesh.copy()
     mesh.update_faces(np.random.default_rng(1).random(len(mesh.faces)) < 0.5)
-    opened = dataclasses.replace(task, case=dataclasses.replace(task.case, object_b=annotated(task.case.object_b, mesh)))
+    opened = dataclasses.replace(
+        task, case=dataclasses.replace(task.case, object_b=annotated(task.case.object_b, mesh))
+    )
     # enough to tell that it is open
     query = jnp.asarray(np.random.default_rng(0).uniform(-0.04, 0.04, (300, 3)), jnp.float32)
     opened = dataclasses.replace(opened, demonstration=dataclasses.replace(task.demonstration, query=query))
@@ -588,14 +639,20 @@ def test_the_chosen_start_has_the_least_score_and_the_best_are_told_apart(task, 
     found = score("ICP", Attempt(several(task)[order], np.array([1.0, 2.0, 3.0])[order], 0.0), task)
     assert found.starts == 3
     assert found.distances[0] == pytest.approx(0.04, abs=1e-6) and found.path_error == pytest.approx(0.04, abs=1e-6)
-    assert found.best_pick == pytest.approx((0.003, 0), abs=0.1) and found.best_pick[0] == pytest.approx(0.003, abs=1e-6)
+    assert found.best_pick == pytest.approx((0.003, 0), abs=0.1) and found.best_pick[0] == pytest.approx(
+        0.003, abs=1e-6
+    )
     assert found.best_path == pytest.approx(0.001 / 6, abs=1e-6)
 
 
 def test_the_best_pick_weighs_a_centimetre_as_ten_degrees(task):
     """0.9 cm and 1 degree beat 0.2 cm and 9 degrees: 1.0 against 1.1."""
     good = perfect(task)[0]
-    found = score("ICP", Attempt(np.stack([displaced(good, (0.002, 0, 0), 9), displaced(good, (0.009, 0, 0), 1)]), np.zeros(2), 0.0), task)
+    found = score(
+        "ICP",
+        Attempt(np.stack([displaced(good, (0.002, 0, 0), 9), displaced(good, (0.009, 0, 0), 1)]), np.zeros(2), 0.0),
+        task,
+    )
     assert found.best_pick == pytest.approx((0.009, 1), abs=0.05)
 
 
@@ -604,7 +661,9 @@ def test_a_start_that_became_non_finite_spoils_nothing(task):
     with jax.debug_nans(False):
         found = score("TDF, l_p", Attempt(paths, np.array([np.nan, 1.0, 2.0, 3.0]), 0.0), task)
         lost = score("TDF, l_p", Attempt(paths[:1], np.array([np.nan]), 0.0, np.nan), task)
-    assert found == dataclasses.replace(score("TDF, l_p", Attempt(paths[1:], np.array([1.0, 2.0, 3.0]), 0.0), task), starts=4)
+    assert found == dataclasses.replace(
+        score("TDF, l_p", Attempt(paths[1:], np.array([1.0, 2.0, 3.0]), 0.0), task), starts=4
+    )
     # a task that is lost altogether is a failure that can be told
     json.dumps(dataclasses.asdict(lost), allow_nan=False)
     assert not lost.succeeds(0.05, 30)
@@ -613,9 +672,18 @@ def test_a_start_that_became_non_finite_spoils_nothing(task):
 def made(pick=0.0, angle=0.0, *, rest=0.01, method="tdf_jax", **about):
     """A score: one task by one method, its pick's errors and the distance of the other waypoints."""
     about = {"task": 0, "instance": "mug 0", "path": "line", "displacement": "none", "clouds": "full"} | about
-    best = {"best_pick": (pick, angle), "best_path": rest, "frechet": rest, "jerk": 1.0, "longest_step": 1.2, "expected_step": 1.1}
+    best = {
+        "best_pick": (pick, angle),
+        "best_path": rest,
+        "frechet": rest,
+        "jerk": 1.0,
+        "longest_step": 1.2,
+        "expected_step": 1.1,
+    }
     rest = {"distances": [pick, *[rest] * 5, 0.0], "angles": [angle, *[2.0] * 5, 0.0]} | best
-    return Score(method=method, **{**rest, "penetration": None, "starts": 2, "seconds": 0.5, "confidence": None, **about})
+    return Score(
+        method=method, **{**rest, "penetration": None, "starts": 2, "seconds": 0.5, "confidence": None, **about}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -627,10 +695,35 @@ def many():
         for index in range(60):
             numbers = rng.gamma(1.0, 0.015, 7).tolist(), rng.gamma(1.0, 12.0, 7).tolist()
             best = (numbers[0][0] / 2, numbers[1][0] / 2)
-            more = dict(zip(("best_path", "frechet", "jerk", "longest_step", "expected_step", "seconds"), rng.gamma(2.0, 0.5, 6).tolist()))
-            sure_of = {"confidence": float(rng.uniform()) if method == "tdf_jax" else None, "penetration": float(rng.normal()) if index % 3 else None}
-            about = {"task": index, "instance": f"mug {index // 3}", "path": list(PATHS)[index % 6], "displacement": list(DISPLACEMENTS)[index // 6 % 4]}
-            found.append(Score(method=method, clouds="full", distances=numbers[0], angles=numbers[1], best_pick=best, starts=3, **about, **more, **sure_of))
+            more = dict(
+                zip(
+                    ("best_path", "frechet", "jerk", "longest_step", "expected_step", "seconds"),
+                    rng.gamma(2.0, 0.5, 6).tolist(),
+                )
+            )
+            sure_of = {
+                "confidence": float(rng.uniform()) if method == "tdf_jax" else None,
+                "penetration": float(rng.normal()) if index % 3 else None,
+            }
+            about = {
+                "task": index,
+                "instance": f"mug {index // 3}",
+                "path": list(PATHS)[index % 6],
+                "displacement": list(DISPLACEMENTS)[index // 6 % 4],
+            }
+            found.append(
+                Score(
+                    method=method,
+                    clouds="full",
+                    distances=numbers[0],
+                    angles=numbers[1],
+                    best_pick=best,
+                    starts=3,
+                    **about,
+                    **more,
+                    **sure_of,
+                )
+            )
     return found
 
 
@@ -639,11 +732,21 @@ def test_errors_are_summarised_by_hand(many):
     row = summarised(ours)
     distance, angle = (np.array([getattr(one, name) for one in ours]) for name in ("distances", "angles"))
     assert (row["tasks"], row["objects"]) == (60, 20)
-    for name, values in {"pick_%s_cm": 100 * distance[:, 0], "pick_%s_deg": angle[:, 0], "waypoint_%s_cm": 100 * distance[:, :6].ravel()}.items():
-        assert row[name % "median"] == pytest.approx(np.quantile(values, 0.5)) and row[name % "p90"] == pytest.approx(np.quantile(values, 0.9))
-    assert row["waypoint_median_deg"] == pytest.approx(np.quantile(angle[:, :6], 0.5)) and row["waypoint_p90_deg"] == pytest.approx(np.quantile(angle[:, :6], 0.9))
+    for name, values in {
+        "pick_%s_cm": 100 * distance[:, 0],
+        "pick_%s_deg": angle[:, 0],
+        "waypoint_%s_cm": 100 * distance[:, :6].ravel(),
+    }.items():
+        assert row[name % "median"] == pytest.approx(np.quantile(values, 0.5)) and row[name % "p90"] == pytest.approx(
+            np.quantile(values, 0.9)
+        )
+    assert row["waypoint_median_deg"] == pytest.approx(np.quantile(angle[:, :6], 0.5)) and row[
+        "waypoint_p90_deg"
+    ] == pytest.approx(np.quantile(angle[:, :6], 0.9))
     paths = 100 * distance[:, :6].sum(axis=1) / 6
-    assert row["path_median_cm"] == pytest.approx(np.quantile(paths, 0.5)) and row["path_p90_cm"] == pytest.approx(np.quantile(paths, 0.9))
+    assert row["path_median_cm"] == pytest.approx(np.quantile(paths, 0.5)) and row["path_p90_cm"] == pytest.approx(
+        np.quantile(paths, 0.9)
+    )
     for name, metres, degrees in (("1cm_10deg", 0.01, 10), ("2cm_20deg", 0.02, 20), ("5cm_30deg", 0.05, 30)):
         right = sum(d <= metres and a <= degrees for d, a in zip(distance[:, 0], angle[:, 0]))
         best = sum(d / 2 <= metres and a / 2 <= degrees for d, a in zip(distance[:, 0], angle[:, 0]))
@@ -654,7 +757,9 @@ def test_errors_are_summarised_by_hand(many):
         ("longest_step_median", "longest_step", 1), ("expected_step_median", "expected_step", 1), ("seconds_median", "seconds", 1),
     ):  # fmt: skip
         assert row[name] == pytest.approx(factor * np.quantile([getattr(one, of) for one in ours], 0.5))
-    assert row["penetration_mean"] == pytest.approx(sum(one.penetration for one in ours if one.penetration is not None) / 40)
+    assert row["penetration_mean"] == pytest.approx(
+        sum(one.penetration for one in ours if one.penetration is not None) / 40
+    )
 
 
 def test_flips_are_counted_and_no_penetration_is_none():
@@ -671,7 +776,9 @@ def test_intervals_are_over_objects_contain_the_statistic_and_are_the_same_again
     ours = by_method(many)["tdf_jax"]
     row = summarised(ours)
     assert row == summarised(ours)
-    for name, number in [(f"interval_{k}", row[f"success_{k}"]) for k in scores.THRESHOLDS] + [("interval_path_median_cm", row["path_median_cm"])]:
+    for name, number in [(f"interval_{k}", row[f"success_{k}"]) for k in scores.THRESHOLDS] + [
+        ("interval_path_median_cm", row["path_median_cm"])
+    ]:
         low, high = row[name]
         assert low <= number <= high and low < high
     alone = summarised([dataclasses.replace(one, instance="mug 0") for one in ours])
@@ -706,7 +813,9 @@ def picks(number, truth):
 
 
 def test_calibrated_confidences_have_a_small_error_and_boasting_ones_a_large():
-    honest, boasting = (sure.calibration_error(sure.bins(*picks(8000, truth))) for truth in (lambda p: p, lambda p: 0.3 * p))
+    honest, boasting = (
+        sure.calibration_error(sure.bins(*picks(8000, truth))) for truth in (lambda p: p, lambda p: 0.3 * p)
+    )
     assert honest < 0.02 and boasting == pytest.approx(0.7 * 0.5, abs=0.02)
 
 
@@ -738,7 +847,12 @@ def test_bins_are_of_picks_between_edges_and_none_is_empty(number):
 def test_the_ranking_is_the_share_of_pairs_in_order():
     predicted, right = picks(60, lambda p: p)
     predicted = predicted.round(1)  # with ties
-    counted = [1.0 if a > b else 0.5 if a == b else 0.0 for a, x in zip(predicted, right) for b, y in zip(predicted, right) if x > y]
+    counted = [
+        1.0 if a > b else 0.5 if a == b else 0.0
+        for a, x in zip(predicted, right)
+        for b, y in zip(predicted, right)
+        if x > y
+    ]
     assert sure.ranking(predicted, right) == pytest.approx(sum(counted) / len(counted))
     assert sure.ranking(np.array([0.1, 0.2, 0.8]), np.array([0.0, 0.0, 1.0])) == 1.0
     assert sure.ranking(predicted, np.ones(60)) is None and sure.ranking(predicted, np.zeros(60)) is None
@@ -772,7 +886,11 @@ def test_the_fit_stays_finite_where_right_and_wrong_do_not_overlap():
 
 
 def test_the_default_curve_is_the_fitted_one():
-    assert sure.confidence(0.5) == sure.confidence(0.5, sure.INTERCEPT, sure.SLOPE) == pytest.approx(1 / (1 + 0.5**sure.SLOPE * np.exp(-sure.INTERCEPT)))
+    assert (
+        sure.confidence(0.5)
+        == sure.confidence(0.5, sure.INTERCEPT, sure.SLOPE)
+        == pytest.approx(1 / (1 + 0.5**sure.SLOPE * np.exp(-sure.INTERCEPT)))
+    )
 
 
 # ---- confidence ----
@@ -790,7 +908,10 @@ def test_the_residual_is_0_of_a_perfect_and_1_of_a_constant_match_in_any_unit():
 def test_the_residual_of_the_demonstrated_object_itself_is_0(model, task, values):
     """At the demonstrated pose, descriptors are those that were shown."""
     reference, field = tdf.describe(model, task.demonstration), encode(model, task.case.points_a)
-    points = Rotation.from_quat(shown_in(task)[0, :4], scalar_first=True).apply(np.asarray(task.demonstration.query)) + shown_in(task)[0, 4:]
+    points = (
+        Rotation.from_quat(shown_in(task)[0, :4], scalar_first=True).apply(np.asarray(task.demonstration.query))
+        + shown_in(task)[0, 4:]
+    )
     descriptors, _ = values(field, jnp.asarray(points, jnp.float32))
     energy = float(np.mean(np.abs(np.asarray(descriptors) - reference.descriptors[0])))
     assert pick_residual(energy, reference.descriptors[0]) < 1e-2
@@ -824,7 +945,10 @@ def makers(task, case):
 
 
 def outcomes(makers, model, folder, names=WANTED, **settings):
-    return [(one.index, name, *map(np.asarray, vars(found).values())) for one, name, found in run(makers, model, names, folder, **{"inits": INITS, "progress": False} | settings)]
+    return [
+        (one.index, name, *map(np.asarray, vars(found).values()))
+        for one, name, found in run(makers, model, names, folder, **{"inits": INITS, "progress": False} | settings)
+    ]
 
 
 def assert_equal(found, expected):
@@ -844,14 +968,32 @@ def computed(monkeypatch):
 
 def test_tasks_are_yielded_by_every_method_that_can_try_them(makers, model, tmp_path):
     found = outcomes(makers, model, tmp_path)
-    assert [one[:2] for one in found] == [(8, "copy"), (8, "oracle correspondences"), (8, "ICP"), (9, "copy"), (9, "oracle correspondences"), (9, "ICP"), (8, "copy"), (8, "ICP")]
-    assert_equal(found[:3], [(8, name, *map(np.asarray, vars(Attempts(makers[0](), model, jax.random.key(0), INITS).of(name)).values())) for name in WANTED[:2]] + found[2:3])
+    assert [one[:2] for one in found] == [
+        (8, "copy"),
+        (8, "oracle correspondences"),
+        (8, "ICP"),
+        (9, "copy"),
+        (9, "oracle correspondences"),
+        (9, "ICP"),
+        (8, "copy"),
+        (8, "ICP"),
+    ]
+    assert_equal(
+        found[:3],
+        [
+            (8, name, *map(np.asarray, vars(Attempts(makers[0](), model, jax.random.key(0), INITS).of(name)).values()))
+            for name in WANTED[:2]
+        ]
+        + found[2:3],
+    )
 
 
 def test_variants_are_run_on_every_fifth_task_alone(case, model, tmp_path, monkeypatch):
     monkeypatch.setattr(Attempts, "of", lambda one, name: Attempt(np.zeros((1, 7, 7)), np.zeros(1), 0.0))
     makers = [lambda index=index: make_task(case, SEED, index) for index in range(4, 11)]
-    found = [(one.index, name) for one, name, _ in run(makers, model, ("copy", "random weights"), tmp_path, progress=False)]
+    found = [
+        (one.index, name) for one, name, _ in run(makers, model, ("copy", "random weights"), tmp_path, progress=False)
+    ]
     assert [index for index, name in found if name == "random weights"] == [5, 10]
     assert [index for index, name in found if name == "copy"] == list(range(4, 11))
 
@@ -895,7 +1037,9 @@ def test_what_depends_on_other_settings_is_kept_apart(task, model, tmp_path, com
     assert computed == ["copy", "copy"] and len(list(tmp_path.iterdir())) == 2
 
 
-@pytest.mark.parametrize("damage", [lambda content: content[: len(content) // 2], lambda content: b"", lambda content: b"nonsense" * 20])
+@pytest.mark.parametrize(
+    "damage", [lambda content: content[: len(content) // 2], lambda content: b"", lambda content: b"nonsense" * 20]
+)
 def test_a_damaged_file_is_named(task, model, tmp_path, damage):
     outcomes([lambda: task], model, tmp_path, ("copy",))
     (path,) = tmp_path.iterdir()
@@ -919,7 +1063,11 @@ def shown(monkeypatch):
     """What the library is shown, in order, its clouds of 60 points."""
     seen, describe = [], demonstrations.describe
     monkeypatch.setattr(demonstrations, "POINTS", 60)
-    monkeypatch.setattr(demonstrations, "describe", lambda model, several, combine: seen.append((list(several), combine)) or describe(model, several, combine))
+    monkeypatch.setattr(
+        demonstrations,
+        "describe",
+        lambda model, several, combine: seen.append((list(several), combine)) or describe(model, several, combine),
+    )
     return seen
 
 
@@ -936,7 +1084,11 @@ def asked(tasks, model, folder, counts, **settings):
 def test_picks_are_learnt_from_every_number_in_every_way(tasks, model, tmp_path, shown):
     """One demonstration has one way: of one, mean and median are the same."""
     found = asked(tasks, model, tmp_path, (1, 3))
-    assert [(one.clouds, one.count, one.way) for one in found] == [("full", 1, "mean"), ("full", 3, "mean"), ("full", 3, "median")]
+    assert [(one.clouds, one.count, one.way) for one in found] == [
+        ("full", 1, "mean"),
+        ("full", 3, "mean"),
+        ("full", 3, "median"),
+    ]
     assert [(len(several), combine) for several, combine in shown] == 3 * [(1, "mean"), (3, "mean"), (3, "median")]
     for one in found:
         assert len(one.distances) == len(one.angles) == 3
@@ -972,7 +1124,11 @@ def test_errors_of_picks_are_in_metres_and_degrees(tasks, model, tmp_path, shown
 
     def found(field, reference, key, **settings):
         goals.append(settings)
-        return SimpleNamespace(trajectory=Trajectory(jnp.asarray(displaced(current[-1].expected.wxyz_xyz[:1], (0, 0, 0.03), 40 + len(current)))))
+        return SimpleNamespace(
+            trajectory=Trajectory(
+                jnp.asarray(displaced(current[-1].expected.wxyz_xyz[:1], (0, 0, 0.03), 40 + len(current)))
+            )
+        )
 
     monkeypatch.setattr(demonstrations, "carry", found)
     (one,) = learnt([lambda task=task: make(task) for task in tasks], model, (1,), tmp_path, progress=False)
@@ -986,7 +1142,9 @@ def test_what_was_learnt_is_kept(tasks, model, tmp_path, shown):
     assert len(shown) == 9
     shown.clear()
     assert asked(tasks, model, tmp_path, (1, 3)) == first
-    assert asked(tasks[:2], model, tmp_path, (3,)) == [dataclasses.replace(one, distances=one.distances[:2], angles=one.angles[:2]) for one in first[1:]]
+    assert asked(tasks[:2], model, tmp_path, (3,)) == [
+        dataclasses.replace(one, distances=one.distances[:2], angles=one.angles[:2]) for one in first[1:]
+    ]
     assert shown == []
     more = asked(tasks, model, tmp_path, (1, 2, 3))
     assert [len(several) for several, _ in shown] == 3 * [2, 2]
@@ -1015,7 +1173,9 @@ def test_what_was_learnt_otherwise_is_kept_apart(tasks, model, tmp_path, shown, 
     case = task.case
     other = {
         "height": lambda: make_task(mug_case(SEED, 1, points=60, height=0.1), SEED, 10),
-        "place": lambda: make_task(dataclasses.replace(case, T_world_place_b=case.T_world_b @ case.object_b.rim_frame), SEED, 10),
+        "place": lambda: make_task(
+            dataclasses.replace(case, T_world_place_b=case.T_world_b @ case.object_b.rim_frame), SEED, 10
+        ),
     }.get(changed, lambda: task)()
     if changed == "model":
         model = dataclasses.replace(model, params=jax.tree.map(lambda leaf: 2 * leaf, model.params))
@@ -1026,8 +1186,21 @@ def test_what_was_learnt_otherwise_is_kept_apart(tasks, model, tmp_path, shown, 
 # ---- the page ----
 
 
-SETTINGS = {"weights": "small", "pairs": 60, "seed": 0, "height": 0.12, "clouds": ("full",), "inits": 2, "meshes": None, "poses": 6, "demonstrations": ()}
-LEARNT = [Learnt("full", 1, "mean", [0.004, 0.012, 0.04], [5.0, 9.0, 50.0]), Learnt("full", 3, "median", [0.004, 0.006, 0.008], [1.0, 2.0, 11.0])]
+SETTINGS = {
+    "weights": "small",
+    "pairs": 60,
+    "seed": 0,
+    "height": 0.12,
+    "clouds": ("full",),
+    "inits": 2,
+    "meshes": None,
+    "poses": 6,
+    "demonstrations": (),
+}
+LEARNT = [
+    Learnt("full", 1, "mean", [0.004, 0.012, 0.04], [5.0, 9.0, 50.0]),
+    Learnt("full", 3, "median", [0.004, 0.006, 0.008], [1.0, 2.0, 11.0]),
+]
 
 
 def tables(text):
@@ -1074,8 +1247,12 @@ def test_every_method_is_on_the_page_with_its_numbers(many, text):
             assert low <= rate <= high
         errors = 100 * distance[:, :6].mean(axis=1)
         median, low, high, most = numbers(paths[1])
-        assert [median, most] == pytest.approx([np.quantile(errors, q) for q in (0.5, 0.9)], abs=0.006) and low <= median <= high
-        assert numbers(paths[3]) == pytest.approx([np.quantile(100 * distance[:, :6], q) for q in (0.5, 0.9)], abs=0.006)
+        assert [median, most] == pytest.approx(
+            [np.quantile(errors, q) for q in (0.5, 0.9)], abs=0.006
+        ) and low <= median <= high
+        assert numbers(paths[3]) == pytest.approx(
+            [np.quantile(100 * distance[:, :6], q) for q in (0.5, 0.9)], abs=0.006
+        )
         assert numbers(paths[4]) == pytest.approx([np.quantile(angle[:, :6], q) for q in (0.5, 0.9)], abs=0.06)
         for table, by in ((displaced_by, "displacement"), (kinds, "path")):
             for head, cell in zip(table[0][1:], table[2 + index][1:], strict=True):
@@ -1086,15 +1263,24 @@ def test_every_method_is_on_the_page_with_its_numbers(many, text):
 
 def test_the_worst_failures_are_listed_by_their_turn(many, text):
     ours = [one for one in many if one.method == "tdf_jax"]
-    failed = sorted((one for one in ours if one.distances[0] > 0.02 or one.angles[0] > 20), key=lambda one: one.angles[0], reverse=True)
+    failed = sorted(
+        (one for one in ours if one.distances[0] > 0.02 or one.angles[0] > 20),
+        key=lambda one: one.angles[0],
+        reverse=True,
+    )
     known = sum(one.best_pick[0] <= 0.02 and one.best_pick[1] <= 20 for one in failed)
     assert len(failed) > LISTED and 0 < known < len(failed)
-    assert f"Of 60 picks of `tdf_jax`, {len(failed)} are off by more than 2 cm or 20°; in {known} of those another candidate was within." in text
+    assert (
+        f"Of 60 picks of `tdf_jax`, {len(failed)} are off by more than 2 cm or 20°; in {known} of those another candidate was within."
+        in text
+    )
     rows = tables(text)[4][2:]
     assert len(rows) == LISTED
     for cells, one in zip(rows, failed):
         assert cells[:3] == [one.instance, "full", one.path.replace("_", " ")]
-        assert [float(cell) for cell in cells[3:]] == pytest.approx([100 * one.distances[0], one.angles[0], 100 * one.best_pick[0], one.best_pick[1]], abs=0.51)
+        assert [float(cell) for cell in cells[3:]] == pytest.approx(
+            [100 * one.distances[0], one.angles[0], 100 * one.best_pick[0], one.best_pick[1]], abs=0.51
+        )
 
 
 def test_the_one_pick_that_failed_is_listed(model):
@@ -1141,14 +1327,20 @@ def test_several_demonstrations_are_told(text):
 def test_clouds_have_tables_of_their_own(many, model):
     noisy = [dataclasses.replace(one, clouds="noise", distances=[2 * x for x in one.distances]) for one in many]
     text = page(many + noisy, model, SETTINGS | {"clouds": ("full", "noise")}, {})
-    assert [line for line in text.splitlines() if line.startswith("## Clouds")] == ["## Clouds: full", "## Clouds: noise"]
+    assert [line for line in text.splitlines() if line.startswith("## Clouds")] == [
+        "## Clouds: full",
+        "## Clouds: noise",
+    ]
     full, noise = (numbers(tables(text)[index][2][2])[0] for index in (0, 4))
     assert noise == pytest.approx(2 * full, abs=0.02)
     assert "--clouds full noise" in text and len(tables(text)) == 3 + 3 + 1 + 1
 
 
 def test_the_page_tells_how_it_was_made(text):
-    assert "`tdf benchmark --weights small --pairs 60 --seed 0 --height 0.12 --clouds full --inits 2`: 20 objects, weights `small`, 2 starts" in text
+    assert (
+        "`tdf benchmark --weights small --pairs 60 --seed 0 --height 0.12 --clouds full --inits 2`: 20 objects, weights `small`, 2 starts"
+        in text
+    )
     assert "{" not in text and "trajectory of 7 poses" in text
 
 
@@ -1156,8 +1348,12 @@ def test_the_record_is_json_with_every_task(many, model, extras):
     found = json.loads(json.dumps(record(many, model, SETTINGS, extras), allow_nan=False))
     assert [(row["clouds"], row["method"]) for row in found["rows"]] == [("full", "copy"), ("full", "tdf_jax")]
     for row in found["rows"]:
-        assert {name: value for name, value in row.items() if name not in ("clouds", "method")} == json.loads(json.dumps(summarised(by_method(many)[row["method"]])))
-    assert len(found["tasks"]) == len(many) and found["tasks"][7]["distances"] == pytest.approx(many[7].distances, abs=1e-6)
+        assert {name: value for name, value in row.items() if name not in ("clouds", "method")} == json.loads(
+            json.dumps(summarised(by_method(many)[row["method"]]))
+        )
+    assert len(found["tasks"]) == len(many) and found["tasks"][7]["distances"] == pytest.approx(
+        many[7].distances, abs=1e-6
+    )
     assert found["weights"] == {"name": "small", "source": "a test"} and found["settings"]["pairs"] == 60
     assert [one["count"] for one in found["demonstrations"]] == [1, 3] and found["reliability"]["picks"] == 60
 

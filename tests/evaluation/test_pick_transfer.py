@@ -39,7 +39,9 @@ def test_the_expected_trajectory_goes_from_the_carried_pick_to_the_goal():
     np.testing.assert_allclose(turns, np.linspace(np.pi / 2, 0, 5), atol=1e-6)
     # Half way: the mean of where the pick's motion (x, y -> -y, x + ...) and the goal's (0.3 m up) carry (0.05, 0.2,
     # 0).
-    np.testing.assert_allclose(expected.translations[2], (np.array([-0.2, 0.07, 0.2]) + [0.05, 0.2, 0.3]) / 2, atol=1e-6)
+    np.testing.assert_allclose(
+        expected.translations[2], (np.array([-0.2, 0.07, 0.2]) + [0.05, 0.2, 0.3]) / 2, atol=1e-6
+    )
 
 
 def test_the_same_object_moved_is_expected_to_carry_its_trajectory():
@@ -65,7 +67,12 @@ def of_objects(case, *names):
 def test_summary_counts(pair):
     distance = np.array([0.005, 0.015, 0.03, 0.005])
     angle = np.array([5.0, 15.0, 5.0, 175.0])
-    row = summary(distance, angle, {"iou": [0.5, None, 0.7, None], "iou_refined": [0.6, None, 0.9, None]}, of_objects(pair, *"abcd"))
+    row = summary(
+        distance,
+        angle,
+        {"iou": [0.5, None, 0.7, None], "iou_refined": [0.6, None, 0.9, None]},
+        of_objects(pair, *"abcd"),
+    )
     assert (row["success_5mm_5deg"], row["success_1cm_10deg"], row["success_2cm_20deg"]) == (0.25, 0.25, 0.5)
     assert row["flips"] == 1 and row["objects"] == row["cases"] == 4
     assert row["iou"] == pytest.approx(0.6) and row["iou_refined"] == pytest.approx(0.75) and row["iou_cases"] == 2
@@ -82,7 +89,9 @@ def test_intervals_draw_objects_and_not_poses(pair):
     distance, angle = np.repeat([0.0, 1.0], 20), np.zeros(40)
     few = summary(distance, angle, {"iou": [None] * 40}, of_objects(pair, *("a" * 20 + "b" * 20)))
     assert few["interval_1cm_10deg"] == [0.0, 1.0] and few["success_1cm_10deg"] == 0.5 and few["iou"] is None
-    low, high = summary(distance, angle, {"iou": [None] * 40}, of_objects(pair, *map(str, range(40))))["interval_1cm_10deg"]
+    low, high = summary(distance, angle, {"iou": [None] * 40}, of_objects(pair, *map(str, range(40))))[
+        "interval_1cm_10deg"
+    ]
     assert 0.3 < low < 0.4 and 0.6 < high < 0.7
     assert summary(distance, angle, {"iou": [None] * 40}, of_objects(pair, *("a" * 40)))["interval_1cm_10deg"] is None
 
@@ -122,7 +131,9 @@ def test_conditions_change_the_new_objects_cloud_and_nothing_else(clouds):
     local = np.linalg.inv(case.T_world_b) @ case.T_world_place_b
     np.testing.assert_allclose(local[:3, 3], scale * full.object_b.handle_frame[:3, 3], atol=1e-9)
     assert case.diagonal == pytest.approx(scale * full.diagonal)
-    assert len(case.points_b) == {"points300": 300, "points1000": 1000, "points3000": 3000, "noise": 300}.get(clouds, 1500)
+    assert len(case.points_b) == {"points300": 300, "points1000": 1000, "points3000": 3000, "noise": 300}.get(
+        clouds, 1500
+    )
     dense = cKDTree(sample_surface(case.object_b.mesh, 20_000, 0))
     off, _ = dense.query((case.points_b - case.T_world_b[:3, 3]) @ case.T_world_b[:3, :3])
     assert off.max() < (0.010 if clouds == "noise" else 0.004 * scale)  # of points on it, about 1 mm
@@ -177,7 +188,10 @@ def test_open_meshes_have_no_iou(small_model):
 
 def test_a_transfer_between_objects_of_half_the_size_is_asked_with_half_the_query(small_model, monkeypatch):
     sizes = []
-    monkeypatch.setattr("tdf_jax.evaluation.pick_transfer.box_query", lambda key, count, size: sizes.append(size) or tdf.box_query(key, 8, size))
+    monkeypatch.setattr(
+        "tdf_jax.evaluation.pick_transfer.box_query",
+        lambda key, count, size: sizes.append(size) or tdf.box_query(key, 8, size),
+    )
     cases = [mug_case(0, 0, points=40, clouds=clouds) for clouds in ("full", "half")]
     transferred(small_model, cases, config=tdf.OptimizeConfig(inits=2, iterations=1), progress=False)
     assert sizes == [QUERY_SIZE, QUERY_SIZE / 2]
@@ -187,7 +201,10 @@ def test_every_case_and_network_runs_the_programs_of_the_first(small_model):
     """Clouds of any number of points are thinned to one; no later case compiles anything."""
     model = dataclasses.replace(small_model, info=tdf.ModelInfo("small", "a test", cloud_points=40))
     config = tdf.OptimizeConfig(inits=2, iterations=2)
-    batches = [[mug_case(0, index, points=60, clouds=clouds)] for index, clouds in enumerate(("full", "half", "views1", "noise"))]
+    batches = [
+        [mug_case(0, index, points=60, clouds=clouds)]
+        for index, clouds in enumerate(("full", "half", "views1", "noise"))
+    ]
     compare(batches[0], model, BASELINES, config=config, progress=False)
     with compilations() as names:
         for cases in batches[1:]:
@@ -196,7 +213,9 @@ def test_every_case_and_network_runs_the_programs_of_the_first(small_model):
 
 
 def test_an_unknown_baseline_is_told_before_anything_runs():
-    with pytest.raises(InputError, match=r"compare\(\): baselines has 'RANSAC'; expected some of random weights, PCA, ICP"):
+    with pytest.raises(
+        InputError, match=r"compare\(\): baselines has 'RANSAC'; expected some of random weights, PCA, ICP"
+    ):
         compare([], None, ("ICP", "RANSAC"))
 
 

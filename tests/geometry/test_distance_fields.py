@@ -58,7 +58,9 @@ def test_distances_to_a_turned_box_are_exact():
 def test_gradients_are_those_of_the_distances(of):
     with enabled("float64"):
         box = box_obstacle((0.3, 0.1, 0.0), SIZE, random_poses(0, 1)[0, :4])
-        grid = DistanceGrid(jnp.array([0.2, 0.0, -0.1]), jnp.array(0.02), jnp.asarray(np.random.default_rng(0).normal(size=(9, 10, 11))))
+        grid = DistanceGrid(
+            jnp.array([0.2, 0.0, -0.1]), jnp.array(0.02), jnp.asarray(np.random.default_rng(0).normal(size=(9, 10, 11)))
+        )
         x = jnp.asarray(np.random.default_rng(1).uniform(-0.1, 0.5, (300, 3)))
         obstacle = {"box": box, "grid": grid}[of]
         np.testing.assert_allclose(gradients(obstacle, x), slopes(obstacle, x), atol=1e-5, rtol=1e-6)
@@ -73,18 +75,26 @@ def test_gradients_are_finite_where_distances_have_kinks():
     # The middle of a wall pushes out by one of its sides, and a side straight out: a gradient of zero would keep a
     # motion where it is.
     np.testing.assert_allclose(np.abs(found[:3]), [[0, 0, 1], [0, 0, 1], [1, 0, 0]], atol=1e-6)
-    grid = DistanceGrid(jnp.zeros(3), jnp.array(0.5), jnp.asarray(np.random.default_rng(0).normal(size=(3, 3, 3)), jnp.float32))
-    assert np.isfinite(gradients(grid, jnp.asarray([[0.5, 0.5, 0.5], [1.0, 0.2, 0.2], [1.0, 1.0, 1.0], [0.0, 0.0, -1.0]]))).all()
+    grid = DistanceGrid(
+        jnp.zeros(3), jnp.array(0.5), jnp.asarray(np.random.default_rng(0).normal(size=(3, 3, 3)), jnp.float32)
+    )
+    assert np.isfinite(
+        gradients(grid, jnp.asarray([[0.5, 0.5, 0.5], [1.0, 0.2, 0.2], [1.0, 1.0, 1.0], [0.0, 0.0, -1.0]]))
+    ).all()
 
 
 # Grids
 
 
 def test_a_grid_interpolates_and_goes_on_outside():
-    values = jnp.asarray(np.add.outer(np.add.outer(np.arange(3.0), 10 * np.arange(4.0)), 100 * np.arange(5.0)), jnp.float32)
+    values = jnp.asarray(
+        np.add.outer(np.add.outer(np.arange(3.0), 10 * np.arange(4.0)), 100 * np.arange(5.0)), jnp.float32
+    )
     grid = DistanceGrid(jnp.asarray([1.0, 0, 0]), jnp.asarray(0.1), values)
     inside = np.random.default_rng(0).uniform(0, 1, (50, 3)) * [0.2, 0.3, 0.4]
-    np.testing.assert_allclose(grid.distance(jnp.asarray(inside + [1, 0, 0])), inside @ [10, 100, 1000], rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(
+        grid.distance(jnp.asarray(inside + [1, 0, 0])), inside @ [10, 100, 1000], rtol=1e-4, atol=1e-3
+    )
     # 3 to one side and 4 to another from the corner (2, 0, 4), whose value is 402.
     np.testing.assert_allclose(grid.distance(jnp.asarray([1.2 + 3, -4, 0.4])), 402 + 5, rtol=1e-6)
 
@@ -121,7 +131,9 @@ def test_a_cloud_is_a_ball_about_every_point():
     points = random_cloud(0, 60)
     x = points[np.random.default_rng(1).integers(0, 60, 500)] + np.random.default_rng(2).uniform(-0.03, 0.03, (500, 3))
     nearest = np.linalg.norm(x[:, None] - points, axis=-1).min(axis=1)
-    error = np.asarray(cloud_obstacle(points, radius=0.004, pitch=0.002, pad=0.03).distance(jnp.asarray(x))) - (nearest - 0.004)
+    error = np.asarray(cloud_obstacle(points, radius=0.004, pitch=0.002, pad=0.03).distance(jnp.asarray(x))) - (
+        nearest - 0.004
+    )
     assert np.abs(error).max() < 0.87 * 0.002 and error.mean() < 2e-4
     assert np.asarray(cloud_obstacle(points).distance(jnp.asarray(points))).max() < 0
 
@@ -143,7 +155,11 @@ def test_distances_to_a_field_are_those_to_the_mug(mug):
     igl = pytest.importorskip("igl")
     rng = np.random.default_rng(0)
     x = points[rng.integers(0, len(points), 3000)] + rng.uniform(-0.02, 0.02, (3000, 3))
-    away = np.sqrt(igl.point_mesh_squared_distance(x - moved, np.asarray(made.mesh.vertices), np.asarray(made.mesh.faces, np.int64))[0])
+    away = np.sqrt(
+        igl.point_mesh_squared_distance(
+            x - moved, np.asarray(made.mesh.vertices), np.asarray(made.mesh.faces, np.int64)
+        )[0]
+    )
     true = np.where(made.contains(x - moved), -away, away)
     obstacle = field_obstacle(field, points)
     error = np.abs(np.asarray(obstacle.distance(jnp.asarray(x))) - true)
@@ -195,4 +211,6 @@ def test_every_obstacle_is_a_pytree_that_compiles():
     for obstacle in (box, grid):
         assert isinstance(obstacle, obstacles.Box | obstacles.DistanceGrid)
         x = jnp.asarray([[0.3, 0.2, 0.1]])
-        np.testing.assert_allclose(jax.jit(lambda obstacle: obstacle.distance(x))(obstacle), obstacle.distance(x), rtol=1e-6)
+        np.testing.assert_allclose(
+            jax.jit(lambda obstacle: obstacle.distance(x))(obstacle), obstacle.distance(x), rtol=1e-6
+        )

@@ -30,11 +30,15 @@ def test_a_volume_is_a_cube_of_points_about_its_middle():
     grid = volume_grid(0.3, 4, (0.0, 1.0, 0.0))
     assert grid.shape == (4, 4, 4)
     np.testing.assert_allclose(grid.points[0, 3, 1], (-0.3, 1.3, -0.1), atol=1e-12)
-    np.testing.assert_allclose(volume_grid(0.3, 4, axes=TILTED).points[3, 0, 0], 0.3 * (TILTED[0] - TILTED[1] - TILTED[2]))
+    np.testing.assert_allclose(
+        volume_grid(0.3, 4, axes=TILTED).points[3, 0, 0], 0.3 * (TILTED[0] - TILTED[1] - TILTED[2])
+    )
 
 
 def test_grids_may_be_lines_and_volumes_of_unequal_sides():
-    volume = Grid(np.array([1.0, 0.0, 0.0]), TILTED, (np.array([0.0, 1.0]), np.array([0.0, 2.0, 4.0]), np.array([5.0, 5.5])))
+    volume = Grid(
+        np.array([1.0, 0.0, 0.0]), TILTED, (np.array([0.0, 1.0]), np.array([0.0, 2.0, 4.0]), np.array([5.0, 5.5]))
+    )
     assert volume.points.shape == (2, 3, 2, 3)
     np.testing.assert_allclose(volume.points[1, 2, 0], (1 + 0.6 - 3.2, 0.8 + 2.4, 5.0))
     line = Grid(np.zeros(3), TILTED[:1], (np.array([1.0, 2.0]),))
@@ -44,7 +48,9 @@ def test_grids_may_be_lines_and_volumes_of_unequal_sides():
 def test_a_neighbourhood_is_the_points_near_a_path():
     corners = np.array([[0.0, 0, 0], [0.2, 0, 0], [0.2, 0.1, 0]])
     grid = path_grid(corners, 0.05, 0.01)
-    np.testing.assert_array_equal(grid.mask.ravel(), distance_from_polyline(grid.points.reshape(-1, 3), corners) <= 0.05)
+    np.testing.assert_array_equal(
+        grid.mask.ravel(), distance_from_polyline(grid.points.reshape(-1, 3), corners) <= 0.05
+    )
     for corner in corners:  # the lattice goes through the first corner, and here through the others
         assert np.abs(grid.points - corner).max(axis=-1).min() < 1e-12
     points = grid.points[grid.mask]
@@ -67,7 +73,9 @@ def test_single_precision_is_even_enough():
 
 def test_a_trajectory_has_a_neighbourhood():
     path = tdf.line(3, start=(0, 0, 0), end=(0.3, 0, 0))
-    np.testing.assert_array_equal(path_grid(path, 0.05, 0.02).mask, path_grid(np.asarray(path.translations), 0.05, 0.02).mask)
+    np.testing.assert_array_equal(
+        path_grid(path, 0.05, 0.02).mask, path_grid(np.asarray(path.translations), 0.05, 0.02).mask
+    )
 
 
 def test_distances_from_a_polyline():

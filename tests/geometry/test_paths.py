@@ -114,7 +114,10 @@ def angles_to(trajectory, rotation):
 
 def test_a_lift_goes_up_across_and_down():
     """0.15 up, 0.3 across, 0.15 down: 0.6 in six steps of 0.1; it turns on the 0.3 across only."""
-    first, last = Rotation.from_rotvec([0.3, -0.5, 1]), Rotation.from_rotvec([0.3, 0, 0]) * Rotation.from_rotvec([0.3, -0.5, 1])
+    first, last = (
+        Rotation.from_rotvec([0.3, -0.5, 1]),
+        Rotation.from_rotvec([0.3, 0, 0]) * Rotation.from_rotvec([0.3, -0.5, 1]),
+    )
     path = lift_over(7, rotation=first.as_matrix(), end_rotation=last.as_matrix())
     expected = [[0, 0, 0], [0, 0, 0.1], [0, 0.05, 0.15], [0, 0.15, 0.15], [0, 0.25, 0.15], [0, 0.3, 0.1], [0, 0.3, 0]]
     np.testing.assert_allclose(path.translations, expected, atol=1e-6)
@@ -132,7 +135,9 @@ def test_a_pour_stays_upright_until_it_goes_down():
     assert (degrees[t[:, 1] < 0.6 * 0.3 - 0.005] < 0.05).all() and degrees[-1] == pytest.approx(80, abs=0.05)
     assert (np.diff(degrees) > -0.05).all()
     # Forwards: what was on top leans towards the end, +y.
-    np.testing.assert_allclose(np.array(path.rotations[-1]) @ [0, 0, 1], [0, np.sin(np.radians(80)), np.cos(np.radians(80))], atol=1e-5)
+    np.testing.assert_allclose(
+        np.array(path.rotations[-1]) @ [0, 0, 1], [0, np.sin(np.radians(80)), np.cos(np.radians(80))], atol=1e-5
+    )
 
 
 def test_hanging_ends_straight_and_without_a_turn():

@@ -68,7 +68,9 @@ def test_the_nearest_turn_is_the_best_of_all_that_are_allowed(fold, seed):
 def test_a_turned_copy_is_turned_back_as_far_as_the_symmetry_allows(fold):
     truth = np.random.default_rng(3).normal(size=(5, 3))
     for angle in np.radians([-170, -95, -50, -44, 0, 10, 44, 46, 89, 91, 134, 136, 179]):
-        expected = angle if fold == ROUND else min(turns(fold), key=lambda turn: abs(np.angle(np.exp(1j * (turn - angle)))))
+        expected = (
+            angle if fold == ROUND else min(turns(fold), key=lambda turn: abs(np.angle(np.exp(1j * (turn - angle)))))
+        )
         turn = nearest_turn(turned(truth, angle), truth, fold)
         np.testing.assert_allclose(np.exp(1j * turn), np.exp(1j * expected), atol=1e-9)
 

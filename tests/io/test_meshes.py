@@ -82,7 +82,9 @@ def test_inside_agrees_with_generated_mugs(index):
     expected = mug.contains(x)
     assert expected.sum() > 100
     np.testing.assert_array_equal(inside(mug.mesh, x), expected)
-    np.testing.assert_array_equal(inside(trimesh.Trimesh(mug.mesh.vertices, mug.mesh.faces[:, ::-1], process=False), x), expected)
+    np.testing.assert_array_equal(
+        inside(trimesh.Trimesh(mug.mesh.vertices, mug.mesh.faces[:, ::-1], process=False), x), expected
+    )
     assert np.mean(inside(trimesh.Trimesh(mug.mesh.vertices, mug.mesh.faces[3:], process=False), x) == expected) > 0.998
     half = np.random.default_rng(1).random(len(mug.mesh.faces)) < 0.5
     assert inside(trimesh.Trimesh(mug.mesh.vertices, mug.mesh.faces[half], process=False), x) is None
@@ -90,5 +92,7 @@ def test_inside_agrees_with_generated_mugs(index):
 
 def test_a_missing_library_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "igl", None)
-    with pytest.raises(InputError, match=r"libigl is not installed; expected the extra 'mesh'; run: pip install 'tdf_jax\[mesh\]'"):
+    with pytest.raises(
+        InputError, match=r"libigl is not installed; expected the extra 'mesh'; run: pip install 'tdf_jax\[mesh\]'"
+    ):
         winding_number(trimesh.creation.box(), np.zeros((1, 3)))

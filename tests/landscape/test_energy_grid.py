@@ -86,7 +86,13 @@ def test_the_best_of_several_rotations_is_kept_for_each_point_and_waypoint(field
     np.testing.assert_array_equal(best.minimisers, each.minimisers)
     np.testing.assert_array_equal(best.minimiser_rotations, each.minimiser_rotations)
     for waypoint, (x, R) in enumerate(zip(best.minimisers, best.minimiser_rotations)):
-        found = waypoint_loss(jnp.asarray(R, jnp.float32), jnp.asarray(x, jnp.float32), field, reference.query, reference.descriptors[waypoint])
+        found = waypoint_loss(
+            jnp.asarray(R, jnp.float32),
+            jnp.asarray(x, jnp.float32),
+            field,
+            reference.query,
+            reference.descriptors[waypoint],
+        )
         np.testing.assert_allclose(found, best.values[waypoint].min(), rtol=1e-5)
 
 
@@ -109,7 +115,9 @@ def test_the_demonstrations_own_waypoints_are_the_minimisers(small_model):
     path = jnp.asarray([[1, 0, 0, 0, *grid.points[place]] for place in places], jnp.float32)
     query = tdf.box_query(jax.random.key(2), count=8, size=0.05)
     demonstration = tdf.Demonstration(jnp.asarray(random_cloud(0), jnp.float32), tdf.Trajectory(path), query)
-    landscape = energy_landscape(tdf.encode(small_model, demonstration.points), tdf.describe(small_model, demonstration), grid)
+    landscape = energy_landscape(
+        tdf.encode(small_model, demonstration.points), tdf.describe(small_model, demonstration), grid
+    )
     np.testing.assert_allclose(landscape.minimisers, path[:, 4:], atol=1e-6)
     np.testing.assert_allclose(landscape.waypoints, path[:, 4:], atol=1e-6)
     for waypoint, place in enumerate(places):
@@ -160,7 +168,9 @@ def test_the_change_of_a_query_set_is_told(small_model, demonstration, field, re
         changes.append(query_change(field, reference, tdf.describe(small_model, snapped), grid, RANDOM[0]))
     assert 0 < changes[0][0] < changes[0][1] < changes[1][1]
     assert changes[0][0] < 0.3 * changes[1][0]
-    whole = [energy_landscape(field, one, grid, RANDOM[0]).values for one in (reference, tdf.describe(small_model, snapped))]
+    whole = [
+        energy_landscape(field, one, grid, RANDOM[0]).values for one in (reference, tdf.describe(small_model, snapped))
+    ]
     true = np.abs(whole[1] / whole[0] - 1)
     told = query_change(field, reference, tdf.describe(small_model, snapped), grid, RANDOM[0], samples=2000)
     np.testing.assert_allclose(told, (np.median(true), true.max()), rtol=0.05)

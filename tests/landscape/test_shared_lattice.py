@@ -20,7 +20,9 @@ def stands(grid, layers, index):
 
 
 @pytest.mark.parametrize("share", [True, False])
-@pytest.mark.parametrize("grid", [plane_grid(0.06, 11), plane_grid(0.06, 11, axes=TILTED[:2]), volume_grid(0.03, 6), plane_grid(0.05, 8)])
+@pytest.mark.parametrize(
+    "grid", [plane_grid(0.06, 11), plane_grid(0.06, 11, axes=TILTED[:2]), volume_grid(0.03, 6), plane_grid(0.05, 8)]
+)
 def test_layers_put_every_query_point_where_it_stands(grid, share):
     rng = np.random.default_rng(0)
     offsets = np.concatenate([tdf.lattice_query((2, 3, 2), 0.012), rng.normal(size=(5, 3)) * 0.03])
@@ -79,7 +81,8 @@ def test_points_drawn_at_random_share_nothing():
 
 
 @pytest.mark.parametrize(
-    ("shape", "span"), [((101, 101), (5, 5)), ((64, 64, 64), (5, 5, 6)), ((7,), (0,)), ((2, 3, 2000), (0, 0, 3)), ((9, 5), (40, 200))]
+    ("shape", "span"),
+    [((101, 101), (5, 5)), ((64, 64, 64), (5, 5, 6)), ((7,), (0,)), ((2, 3, 2000), (0, 0, 3)), ((9, 5), (40, 200))],
 )
 def test_tiles_cover_a_grid_once(shape, span, monkeypatch):
     monkeypatch.setattr(lattice, "NODES", 3000)

@@ -15,7 +15,11 @@ from tdf_jax.landscape.storage import Landscape, load_landscape, save_landscape
 def made(values, grid=None, **fields):
     """A landscape of given energies, in one orientation."""
     values = np.asarray(values, float)
-    fields = {"waypoints": np.zeros((len(values), 3)), "rotations": np.eye(3)[None], "turned": np.zeros(values.shape, np.int32)} | fields
+    fields = {
+        "waypoints": np.zeros((len(values), 3)),
+        "rotations": np.eye(3)[None],
+        "turned": np.zeros(values.shape, np.int32),
+    } | fields
     return Landscape(grid or plane_grid(1.0, 2), values, **fields)
 
 
@@ -69,7 +73,15 @@ def test_a_file_gives_the_same_landscape(tmp_path, kind):
     shape = (2, *((4,) if kind == "each" else ()), *grid.shape)
     turned = None if kind == "each" else rng.integers(4, size=shape).astype(np.int32)
     rotations = tdf.rotation_grid(4)
-    first = Landscape(grid, rng.uniform(size=shape).astype(np.float32), rng.normal(size=(2, 3)), rotations, turned, "soft_least", 0.002)
+    first = Landscape(
+        grid,
+        rng.uniform(size=shape).astype(np.float32),
+        rng.normal(size=(2, 3)),
+        rotations,
+        turned,
+        "soft_least",
+        0.002,
+    )
     save_landscape(tmp_path / "it.npz", first, {"seed": 3})
     again, about = load_landscape(tmp_path / "it.npz")
     assert about == {"seed": 3}
@@ -108,7 +120,11 @@ def test_files_that_hold_something_else_are_refused(tmp_path, landscape):
 
 @pytest.mark.parametrize(
     ("changes", "words"),
-    [({"reduce": "median"}, "reduce is 'median'"), ({"temperature": 0.0}, "temperature is 0.0"), ({"turned": None}, "values have shape")],
+    [
+        ({"reduce": "median"}, "reduce is 'median'"),
+        ({"temperature": 0.0}, "temperature is 0.0"),
+        ({"turned": None}, "values have shape"),
+    ],
 )
 def test_landscapes_that_make_no_sense_are_refused(landscape, changes, words):
     with pytest.raises(InputError, match=words):

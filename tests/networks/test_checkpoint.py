@@ -16,7 +16,9 @@ from tdf_jax.networks.checkpoint import available_models, load_model, save_model
 from tdf_jax.networks.model import Model, ModelInfo
 from tdf_jax.networks.occupancy import NetworkConfig, parameter_shapes
 
-CONFIG = NetworkConfig(latent=2, vector_hidden=3, vector_width=6, decoder_width=4, blocks=1, neighbours=3, scaling=7.5, asymmetry=0.1)
+CONFIG = NetworkConfig(
+    latent=2, vector_hidden=3, vector_width=6, decoder_width=4, blocks=1, neighbours=3, scaling=7.5, asymmetry=0.1
+)
 
 
 def make_model(**info):
@@ -111,7 +113,9 @@ def test_a_model_is_a_pytree_with_static_sizes():
 def installed(monkeypatch, root, direct_url):
     """As if the package were in `root`, installed as its metadata say."""
     monkeypatch.setattr(checkpoint.resources, "files", lambda name: root / name)
-    monkeypatch.setattr(checkpoint.metadata, "distribution", lambda name: SimpleNamespace(read_text=lambda file: direct_url))
+    monkeypatch.setattr(
+        checkpoint.metadata, "distribution", lambda name: SimpleNamespace(read_text=lambda file: direct_url)
+    )
 
 
 @pytest.mark.parametrize("folder", ["weights", "tdf_jax/weights"], ids=["checkout", "wheel"])

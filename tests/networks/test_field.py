@@ -138,7 +138,9 @@ def test_a_dense_cloud_is_thinned_several_times_and_the_latents_averaged(small_m
     assert agreed.any()
     found = tdf.encode(thinning_model, points, thinnings=4)
     np.testing.assert_allclose(found.latent, latents[agreed].mean(axis=0), atol=1e-6)
-    np.testing.assert_allclose(found.origin, np.mean([field.origin for field in fields], axis=0, where=agreed[:, None]), atol=1e-7)
+    np.testing.assert_allclose(
+        found.origin, np.mean([field.origin for field in fields], axis=0, where=agreed[:, None]), atol=1e-7
+    )
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +157,11 @@ def test_a_displaced_cloud_is_seen_away_from_its_farthest_point(small_model, dis
     latents = []
     for cloud in clouds:
         centred = cloud - cloud.mean(axis=0)
-        latents.append(np.asarray(encode_latent(small_model.params, small_model.config, centred - 0.2 * (tip - cloud.mean(axis=0)))))
+        latents.append(
+            np.asarray(
+                encode_latent(small_model.params, small_model.config, centred - 0.2 * (tip - cloud.mean(axis=0)))
+            )
+        )
     plain = np.stack([tdf.encode(small_model, cloud).latent for cloud in clouds])
     assert np.abs(np.stack(latents) - plain).max() > 1e-2 * np.abs(plain).max()
     agreed = np.asarray(agreeing(jnp.asarray(latents), np.ones(4, bool)))
@@ -167,9 +173,13 @@ def test_a_displaced_cloud_is_seen_away_from_its_farthest_point(small_model, dis
     centred = few - few.mean(axis=0)
     alone = encode_latent(small_model.params, displacing_model.config, centred)
     farthest = centred[np.argmax(np.linalg.norm(centred, axis=1))]
-    np.testing.assert_allclose(alone, encode_latent(small_model.params, small_model.config, centred - 0.2 * farthest), atol=1e-5)
+    np.testing.assert_allclose(
+        alone, encode_latent(small_model.params, small_model.config, centred - 0.2 * farthest), atol=1e-5
+    )
     filled, used = np.concatenate([centred, 9 + centred[:5]]), np.arange(27) < 22
-    np.testing.assert_allclose(encode_latent(small_model.params, displacing_model.config, filled, used), alone, atol=1e-5)
+    np.testing.assert_allclose(
+        encode_latent(small_model.params, displacing_model.config, filled, used), alone, atol=1e-5
+    )
     for field in (tdf.encode(displacing_model, few), jax.jit(lambda points: tdf.encode(displacing_model, points))(few)):
         np.testing.assert_allclose(field.latent, alone, atol=1e-5)
         np.testing.assert_allclose(field.origin, few.mean(axis=0), atol=1e-7)
@@ -191,7 +201,10 @@ def test_a_symmetric_object_has_sides_to_a_network_with_asymmetry_only(small_mod
 def noisy(latent, turns, seed):
     """A latent turned about z by degrees, with noise of a tenth."""
     noise = np.random.default_rng(seed).normal(size=(len(turns), *latent.shape)) * 0.1 * np.std(latent)
-    return jnp.asarray(latent @ Rotation.from_euler("z", turns[:, None], degrees=True).as_matrix().transpose(0, 2, 1) + noise, jnp.float32)
+    return jnp.asarray(
+        latent @ Rotation.from_euler("z", turns[:, None], degrees=True).as_matrix().transpose(0, 2, 1) + noise,
+        jnp.float32,
+    )
 
 
 @pytest.mark.parametrize(("turns", "kept"), [
@@ -229,7 +242,9 @@ def test_points_are_used_as_they_are_where_there_is_nothing_to_thin(small_model,
     dense, sparse = random_cloud(0, 90), random_cloud(0, 24)
     plain = tdf.encode(small_model, dense).latent  # a density that is not known
     np.testing.assert_array_equal(tdf.encode(thinning_model, dense, thinnings=0).latent, plain)
-    np.testing.assert_allclose(tdf.encode(thinning_model, sparse).latent, tdf.encode(small_model, sparse).latent, atol=1e-6)
+    np.testing.assert_allclose(
+        tdf.encode(thinning_model, sparse).latent, tdf.encode(small_model, sparse).latent, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("model", ["small_model", "thinning_model"])

@@ -35,8 +35,11 @@ def test_the_points_come_to_lie_on_the_surface(mug):
 def test_a_refined_field_moves_and_turns_with_the_points(mug):
     model, field, points = mug
     R, shift = np.asarray(poses.rotation(random_poses(3, 1)[0]), np.float32), np.array([0.3, -0.1, 0.2], np.float32)
-    latent, turned = field.latent, tdf.DescriptorField(
-        refinement.condition(model.params, model.config, field.latent @ R.T), R @ field.origin + shift
+    latent, turned = (
+        field.latent,
+        tdf.DescriptorField(
+            refinement.condition(model.params, model.config, field.latent @ R.T), R @ field.origin + shift
+        ),
     )
     here, there = tdf.refine(model, field, points, 5), tdf.refine(model, turned, points @ R.T + shift, 5)
     change = np.abs(here.latent - latent).max()
@@ -58,9 +61,13 @@ def test_points_are_counted_once_however_few_there_are(small_model, monkeypatch)
     # The first step of every vector that moves is as long as the rate says, against its gradient.
     size = np.sqrt(np.mean(np.sum(np.asarray(field.latent) ** 2, axis=-1)))
     expected = field.latent - refinement.RATE * size * gradient / np.linalg.norm(gradient, axis=-1, keepdims=True)
-    np.testing.assert_allclose(tdf.refine(small_model, field, points, 1).latent, expected, atol=1e-3 * refinement.RATE * size)
+    np.testing.assert_allclose(
+        tdf.refine(small_model, field, points, 1).latent, expected, atol=1e-3 * refinement.RATE * size
+    )
     monkeypatch.setattr(refinement, "POINTS", 40)
-    np.testing.assert_allclose(tdf.refine(small_model, field, points, 1).latent, expected, atol=1e-3 * refinement.RATE * size)
+    np.testing.assert_allclose(
+        tdf.refine(small_model, field, points, 1).latent, expected, atol=1e-3 * refinement.RATE * size
+    )
 
 
 def test_clouds_of_all_sizes_and_steps_run_one_program(small_model):

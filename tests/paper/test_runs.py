@@ -39,7 +39,12 @@ def made(curve=(1.0, 0.5), found=None, expected=None, **fields):
     found = random_poses(0, 4) if found is None else found
     expected = found if expected is None else expected
     values = {"reference": found, "starts": found[None], "found": found[None], "losses": np.array([curve])}
-    values |= {"expected": expected, "path": expected[:, 4:], "descriptor": np.zeros(2), "expected_energy": np.array(0.0)}
+    values |= {
+        "expected": expected,
+        "path": expected[:, 4:],
+        "descriptor": np.zeros(2),
+        "expected_energy": np.array(0.0),
+    }
     return Run(**(values | fields))
 
 
@@ -59,7 +64,9 @@ def test_mugs_have_the_diagonal_asked_for_and_differ():
     for which in (0, 1):
         mug = settings.mug(dataclasses.replace(TINY, diagonal=0.2), which)
         np.testing.assert_allclose(np.linalg.norm(mug.mesh.extents), 0.2, rtol=1e-9)
-    shapes = [settings.mug(dataclasses.replace(TINY, seed=seed), which).parameters for seed in (0, 1) for which in (0, 1)]
+    shapes = [
+        settings.mug(dataclasses.replace(TINY, seed=seed), which).parameters for seed in (0, 1) for which in (0, 1)
+    ]
     assert len({shape.top_radius / shape.height for shape in shapes}) == 4
 
 
@@ -106,7 +113,9 @@ def test_the_optimiser_has_the_numbers_of_the_setting():
     setting = dataclasses.replace(TINY, inits=3, iterations=7, translation_rate=0.02, start="carried", diagonal=0.2)
     expected = tdf.OptimizeConfig(inits=3, iterations=7, translation_rate=0.02, start="carried", start_radius=0.2)
     assert setting.optimiser == expected
-    energy = dataclasses.replace(TINY, k=0.1, compensator=0.3, lever=0.2, pose_norm="metres_radians", compensator_order="infinity", unit=0.5).energy
+    energy = dataclasses.replace(
+        TINY, k=0.1, compensator=0.3, lever=0.2, pose_norm="metres_radians", compensator_order="infinity", unit=0.5
+    ).energy
     assert energy == tdf.EnergyWeights(0.2, 0.3, 0.2, "metres_radians", "infinity")
 
 
@@ -129,7 +138,9 @@ def test_the_correlation_term_may_pull_towards_the_stretched_demonstration(refer
     same = settings.aim(dataclasses.replace(TINY, displacement=(0.1, 0.0, 0.3)), reference)
     assert same is reference
     for displaced, sign in (("goal", 1), ("start", -1)):
-        setting = dataclasses.replace(TINY, poses=4, displacement=(0.1, 0.0, 0.3), displaced=displaced, correlated="stretched")
+        setting = dataclasses.replace(
+            TINY, poses=4, displacement=(0.1, 0.0, 0.3), displaced=displaced, correlated="stretched"
+        )
         moved = settings.aim(setting, reference)
         steps = np.asarray(moved.trajectory.translations - reference.trajectory.translations)
         np.testing.assert_allclose(steps, sign * np.outer([0, 1 / 3, 2 / 3, 1], (0.1, 0.0, 0.3)), atol=1e-6)
@@ -237,7 +248,9 @@ def test_the_path_error_sees_the_corners_that_few_poses_cut():
     three[:, 4:], two[:, 4:] = path[[0, 30, 60]], path[[0, 60]]
     assert made(found=three, path=path).path_error < 1e-12
     np.testing.assert_allclose(made(found=two, path=path).path_error, np.mean(1 - path[:, 1]), rtol=1e-9)
-    np.testing.assert_allclose(distance_from_polyline(np.array([[-3.0, 4, 0], [1, -2, 0]]), np.array([[0.0, 0, 0], [2, 0, 0]])), [5, 2])
+    np.testing.assert_allclose(
+        distance_from_polyline(np.array([[-3.0, 4, 0], [1, -2, 0]]), np.array([[0.0, 0, 0], [2, 0, 0]])), [5, 2]
+    )
 
 
 def test_the_shape_error_ignores_where_a_path_lies_but_not_its_mirror_image():
@@ -246,7 +259,9 @@ def test_the_shape_error_ignores_where_a_path_lies_but_not_its_mirror_image():
     assert shape_error(path, moved) < 1e-7
     assert shape_error(path * (1, 1, -1), moved) > 0.01
     wider = shape_error(1.1 * path, moved)
-    np.testing.assert_allclose(wider, 0.1 * np.sqrt(np.mean(np.sum((path - path.mean(axis=0)) ** 2, axis=1))), rtol=1e-6)
+    np.testing.assert_allclose(
+        wider, 0.1 * np.sqrt(np.mean(np.sum((path - path.mean(axis=0)) ** 2, axis=1))), rtol=1e-6
+    )
 
 
 def test_what_was_computed_is_kept(small_model, run, tmp_path, monkeypatch):
@@ -285,7 +300,9 @@ def test_the_table_has_the_papers_nine_rows_over_the_seeds_and_the_variations():
     first = {group: settings[0] for group, settings in reversed(plan)}
     assert [first[f"n = {n}"].poses for n in (3, 5, 13, 25)] == [3, 5, 13, 25]
     assert [first[f"k = {k}"].k for k in ("0", "0.002", "0.2")] == [0.0, 0.002, 0.2]
-    assert first["last pose free"].fix_last is False and first["nothing"] == dataclasses.replace(TINY, poses=7, trajectory="line")
+    assert first["last pose free"].fix_last is False and first["nothing"] == dataclasses.replace(
+        TINY, poses=7, trajectory="line"
+    )
     assert first["l_p for l_c, infinity"].energy.compensator_order == "infinity"
     # Every variation but the first changes something, and no two are the same.
     del first["table 1"]
@@ -297,13 +314,31 @@ def test_rows_are_means_over_seeds():
     expected = found.copy()
     expected[0, :4] = Rotation.from_euler("x", 30, degrees=True).as_quat(scalar_first=True)
     expected[0, 4:] = (0.03, 0, 0.04)
-    errors = {"found": found, "expected": expected, "descriptor": np.array([0.1, 0.3]), "expected_energy": np.array(0.4)}
+    errors = {
+        "found": found,
+        "expected": expected,
+        "descriptor": np.array([0.1, 0.3]),
+        "expected_energy": np.array(0.4),
+    }
     runs = iter([made((1.0, 0.02), **errors), made((3.0, 0.04), **errors)])
     setting = dataclasses.replace(TINY, trajectory="line", displacement=(0.0, 0.0, 0.4))
     (row,) = table.rows(lambda _: next(runs), [("table 1", [setting, setting])])
     numbers = row.numbers()
-    known = {"pick_cm": 5, "pick_degrees": 30, "waypoint_cm": 5 / 3, "waypoint_degrees": 10, "settled": 1, "longest_step": 4 / 3, "flips": 0}
-    known |= {"descriptor_loss": 0.1, "true_descriptor_loss": 0.3, "true_loss": 0.4, "path_cm": 100 * row.runs[0].path_error}
+    known = {
+        "pick_cm": 5,
+        "pick_degrees": 30,
+        "waypoint_cm": 5 / 3,
+        "waypoint_degrees": 10,
+        "settled": 1,
+        "longest_step": 4 / 3,
+        "flips": 0,
+    }
+    known |= {
+        "descriptor_loss": 0.1,
+        "true_descriptor_loss": 0.3,
+        "true_loss": 0.4,
+        "path_cm": 100 * row.runs[0].path_error,
+    }
     known |= {"shape_cm": 100 * row.runs[0].shape_error, "seeds": 2}
     for name, value in known.items():
         np.testing.assert_allclose(numbers[name], value, rtol=1e-5, err_msg=name)
@@ -335,7 +370,9 @@ def test_tables_show_the_papers_numbers_beside_ours_and_every_variation():
 def test_figures_ask_for_what_the_paper_shows():
     first = figures.figure1(TINY)
     assert (first["l_t"].k, first["l_t + l_c"].k) == (0.0, 0.02) and first["l_t"].seed == first["l_t + l_c"].seed
-    assert set(figures.figure4(TINY)) == {(s, d) for s in ("line", "semicircle", "wave") for d in ((0, 0, 0), (-0.2, 0.1, 0.3))}
+    assert set(figures.figure4(TINY)) == {
+        (s, d) for s in ("line", "semicircle", "wave") for d in ((0, 0, 0), (-0.2, 0.1, 0.3))
+    }
     assert {setting.trajectory for setting in figures.figure5(TINY).values()} == {"line", "semicircle", "wave"}
     third = figures.figure3(TINY)
     assert set(figures.PAPER_DISTANCES) < {setting.distance for setting in third.values()}
@@ -375,7 +412,11 @@ def test_landscapes_are_of_the_named_mug_with_the_demonstrations_orientation(sma
     flat = [panel.path - panel.outline.mean(axis=0) for panel in (own["wave"], turned)]
     R = Rotation.from_euler("z", 60, degrees=True).as_matrix()[:2, :2]
     np.testing.assert_allclose(turned.carried - turned.outline.mean(axis=0), flat[0] @ R.T, atol=1e-5)
-    np.testing.assert_allclose(turned.outline - turned.outline.mean(axis=0), (own["wave"].outline - own["wave"].outline.mean(axis=0)) @ R.T, atol=1e-5)
+    np.testing.assert_allclose(
+        turned.outline - turned.outline.mean(axis=0),
+        (own["wave"].outline - own["wave"].outline.mean(axis=0)) @ R.T,
+        atol=1e-5,
+    )
     mean = landscapes.figure2(small_model, dataclasses.replace(base, field_energy="mean"), "reference mug", 5)["wave"]
     assert (mean.energies > others["reference mug"].energies).all()
     outlines = [panel.outline for panel in others.values()]

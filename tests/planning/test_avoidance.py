@@ -15,7 +15,9 @@ from tdf_jax.planning.distances import Clearance, clearance
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 # A cube of 4 cm that is off the frame's origin, by its corners and its centre.
-BODY = np.array([[x, y, z] for x in (-0.02, 0.02) for y in (-0.02, 0.02) for z in (0.0, 0.04)] + [[0, 0, 0.02]], np.float32)
+BODY = np.array(
+    [[x, y, z] for x in (-0.02, 0.02) for y in (-0.02, 0.02) for z in (0.0, 0.04)] + [[0, 0, 0.02]], np.float32
+)
 LINE = tdf.line(7, (0, 0, 0), (0, 0.4, 0))
 IN_THE_WAY = box_obstacle((0.01, 0.2, 0.02), (0.06, 0.04, 0.08))
 AWAY = box_obstacle((0.5, 0.2, 0.0), (0.06, 0.04, 0.08))
@@ -31,7 +33,9 @@ def least_by_hand(trajectory, body, box_low, box_high, steps=400):
 
 
 def ends_kept(cleared, trajectory):
-    np.testing.assert_array_equal(cleared.trajectory.wxyz_xyz[jnp.array([0, -1])], trajectory.wxyz_xyz[jnp.array([0, -1])])
+    np.testing.assert_array_equal(
+        cleared.trajectory.wxyz_xyz[jnp.array([0, -1])], trajectory.wxyz_xyz[jnp.array([0, -1])]
+    )
     assert cleared.trajectory.poses == trajectory.poses
 
 
@@ -118,7 +122,11 @@ def test_a_post_in_a_semicircle_is_passed_and_margins_are_kept():
 
 
 def test_several_obstacles_of_two_kinds_are_passed():
-    floor = DistanceGrid(jnp.asarray([-1.0, -1, -0.05]), jnp.asarray(1.0), jnp.asarray(np.broadcast_to([0.0, 1.0], (3, 3, 2)), jnp.float32))
+    floor = DistanceGrid(
+        jnp.asarray([-1.0, -1, -0.05]),
+        jnp.asarray(1.0),
+        jnp.asarray(np.broadcast_to([0.0, 1.0], (3, 3, 2)), jnp.float32),
+    )
     scene = [IN_THE_WAY, floor, box_obstacle((-0.06, 0.3, 0.0), (0.05, 0.02, 0.3))]
     cleared = push_clear(LINE, BODY, scene)
     assert_clear(cleared, LINE, scene)
@@ -170,7 +178,10 @@ def test_a_goal_inside_of_an_obstacle_is_told():
     ends_kept(cleared, LINE)
     assert not cleared.clear
     assert "the last pose is 0.080 m inside of obstacle 1" in cleared.status and "move that end" in cleared.status
-    assert "the first pose" in push_clear(LINE, BODY, [box_obstacle((0, 0, 0), (0.2, 0.2, 0.2)), AWAY], config=ONE_LOOK).status
+    assert (
+        "the first pose"
+        in push_clear(LINE, BODY, [box_obstacle((0, 0, 0), (0.2, 0.2, 0.2)), AWAY], config=ONE_LOOK).status
+    )
 
 
 def test_a_closed_room_is_told():
@@ -222,6 +233,13 @@ def test_bad_input_is_refused():
             push_clear(LINE, BODY, [AWAY], margin=margin)
     with pytest.raises(InputError, match="config is"):
         push_clear(LINE, BODY, [AWAY], config={"ramp": 1})
-    for bad in ({"lever": 0.0}, {"ramp": -1.0}, {"deviation": np.inf}, {"contact": -0.1}, {"directions": 0}, {"iterations": 1.5}):
+    for bad in (
+        {"lever": 0.0},
+        {"ramp": -1.0},
+        {"deviation": np.inf},
+        {"contact": -0.1},
+        {"directions": 0},
+        {"iterations": 1.5},
+    ):
         with pytest.raises(InputError, match=rf"ClearanceConfig\(\): {next(iter(bad))} is"):
             ClearanceConfig(**bad)

@@ -98,7 +98,9 @@ def test_the_bottom_edge_is_rounded():
     p = BottleParameters(edge_radius=0.012)
     angle = np.radians([18, 36, 54, 72, 90])  # six rings make the quarter circle
     levels = p.edge_radius * (1 - np.cos(angle))
-    np.testing.assert_allclose(outer(build_bottle(p), levels), p.radius - p.edge_radius * (1 - np.sin(angle)), atol=2e-5)
+    np.testing.assert_allclose(
+        outer(build_bottle(p), levels), p.radius - p.edge_radius * (1 - np.sin(angle)), atol=2e-5
+    )
     base = build_bottle(p).mesh.vertices
     base = base[base[:, 2] < 1e-6 - p.height / 2]
     np.testing.assert_allclose(np.hypot(base[:, 0], base[:, 1]).max(), p.radius - p.edge_radius, atol=1e-6)
@@ -151,7 +153,9 @@ def test_a_cap_is_no_film():
 def test_an_open_mouth_is_as_deep_as_asked_and_narrower_than_the_neck(taper, hole):
     p = BottleParameters(cap_height=0.0, mouth_depth=0.030, neck_taper=taper)
     bottle = build_bottle(p)
-    np.testing.assert_array_equal(on_axis(bottle, [0.05, 0.1898, 0.1902, 0.2199, 0.2201]), [True, True, False, False, False])
+    np.testing.assert_array_equal(
+        on_axis(bottle, [0.05, 0.1898, 0.1902, 0.2199, 0.2201]), [True, True, False, False, False]
+    )
     for level in (0.1905, 0.2199):
         np.testing.assert_allclose(along(bottle, level)[0], hole, atol=1.1e-5)
     assert on_axis(build_bottle(replace(p, mouth_depth=0.0)), [0.1902, 0.2199]).all()
@@ -163,7 +167,12 @@ def test_a_handle_is_a_bar_of_its_section_at_its_reach_with_a_hole_for_fingers()
     middle, bar = (p.handle_top + p.handle_bottom) / 2, p.radius + p.handle_reach
     thick, wide = p.handle_thickness / 2, p.handle_width / 2
     assert at(bottle, bar, 0, middle) and not at(bare, bar, 0, middle)
-    for x, y, clay in ((bar + 0.98 * thick, 0, True), (bar + 1.02 * thick, 0, False), (bar - 0.97 * thick, 0, True), (bar - 1.02 * thick, 0, False)):
+    for x, y, clay in (
+        (bar + 0.98 * thick, 0, True),
+        (bar + 1.02 * thick, 0, False),
+        (bar - 0.97 * thick, 0, True),
+        (bar - 1.02 * thick, 0, False),
+    ):
         assert at(bottle, x, y, middle) == clay
     for side in (-1, 1):
         assert at(bottle, bar, side * 0.97 * wide, middle) and not at(bottle, bar, side * 1.02 * wide, middle)
@@ -179,7 +188,9 @@ def test_a_handle_is_a_bar_of_its_section_at_its_reach_with_a_hole_for_fingers()
 
 def test_a_handle_leaves_the_mouth_open():
     bottle = build_bottle(VARIANTS["handle on the neck"])
-    np.testing.assert_array_equal(on_axis(bottle, [0.189, 0.199, 0.201, 0.21, 0.219]), [True, True, False, False, False])
+    np.testing.assert_array_equal(
+        on_axis(bottle, [0.189, 0.199, 0.201, 0.21, 0.219]), [True, True, False, False, False]
+    )
     assert at(bottle, 0.020, 0, 0.19)  # the upper arm is at the neck
     assert not at(bottle, 0.020, 0, 0.2)
 
@@ -201,10 +212,18 @@ def test_places_lie_on_the_axis_the_neck_between_the_shoulders_half_and_the_top(
     assert over < (p.radius + p.neck_radius) / 2 < under
 
 
-@pytest.mark.parametrize("change, fold", [
-    ({}, 0), ({"aspect": 0.5}, 2), ({"squareness": 6.0}, 4), ({"aspect": 0.5, "squareness": 6.0}, 2),
-    ({"handle": True}, 1), ({"handle": True, "aspect": 0.6}, 1), ({"handle": True, "squareness": 6.0}, 1),
-])
+@pytest.mark.parametrize(
+    "change, fold",
+    [
+        ({}, 0),
+        ({"aspect": 0.5}, 2),
+        ({"squareness": 6.0}, 4),
+        ({"aspect": 0.5, "squareness": 6.0}, 2),
+        ({"handle": True}, 1),
+        ({"handle": True, "aspect": 0.6}, 1),
+        ({"handle": True, "squareness": 6.0}, 1),
+    ],
+)
 def test_the_outline_and_a_handle_decide_the_symmetry(change, fold):
     assert build_bottle(replace(PLAIN, **change)).fold == fold
 
@@ -233,7 +252,9 @@ def test_sampling_covers_the_family_and_repeats_with_the_seed():
         lambda draw: draw.cap_taper < 0.8,
     ):
         assert 0.05 < np.mean([with_it(draw) for draw in draws]) < 0.85
-    assert any(draw.handle and draw.aspect < 1 for draw in draws) and any(draw.handle and draw.squareness > 2 for draw in draws)
+    assert any(draw.handle and draw.aspect < 1 for draw in draws) and any(
+        draw.handle and draw.squareness > 2 for draw in draws
+    )
     assert any(draw.handle and draw.handle_top > draw.shoulder_bottom for draw in draws)
 
 
@@ -297,40 +318,68 @@ def test_bad_dimensions_are_refused_by_name(change, message):
     assert message in str(error.value)
 
 
-@pytest.mark.parametrize("change, message", [
-    ({"handle_reach": -0.01}, "handle_reach is -0.01"),
-    ({"handle_width": 0.0}, "handle_width is 0.0"),
-    ({"handle_bottom": 0.093}, "handle_top and handle_bottom are too close for the thickness"),
-    ({"handle_bottom": 0.126}, "handle_top and handle_bottom are too close"),
-    ({"handle_top": 0.218, "cap_height": 0.0}, "the handle does not end inside the bottle"),
-    ({"handle_top": 0.230}, "the handle does not end inside the bottle"),
-    ({"handle_width": 0.080}, "the handle does not end inside the bottle"),
-    ({"handle_thickness": 0.0245, "handle_reach": 0.018}, "the handle bends more tightly than its thickness allows"),
-    ({"handle_bottom": 0.014}, "handle_bottom is below the body: raise it"),
-    ({"handle_reach": 0.008, "handle_thickness": 0.008}, "the handle leaves no finger hole: raise handle_reach"),
-    # A cap as wide as the handle reaches fills its hole.
-    ({"handle_top": 0.203, "handle_bottom": 0.168, "cap_radius": 0.06, "cap_height": 0.0489}, "the dimensions give no single closed bottle"),
-])
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"handle_reach": -0.01}, "handle_reach is -0.01"),
+        ({"handle_width": 0.0}, "handle_width is 0.0"),
+        ({"handle_bottom": 0.093}, "handle_top and handle_bottom are too close for the thickness"),
+        ({"handle_bottom": 0.126}, "handle_top and handle_bottom are too close"),
+        ({"handle_top": 0.218, "cap_height": 0.0}, "the handle does not end inside the bottle"),
+        ({"handle_top": 0.230}, "the handle does not end inside the bottle"),
+        ({"handle_width": 0.080}, "the handle does not end inside the bottle"),
+        (
+            {"handle_thickness": 0.0245, "handle_reach": 0.018},
+            "the handle bends more tightly than its thickness allows",
+        ),
+        ({"handle_bottom": 0.014}, "handle_bottom is below the body: raise it"),
+        ({"handle_reach": 0.008, "handle_thickness": 0.008}, "the handle leaves no finger hole: raise handle_reach"),
+        # A cap as wide as the handle reaches fills its hole.
+        (
+            {"handle_top": 0.203, "handle_bottom": 0.168, "cap_radius": 0.06, "cap_height": 0.0489},
+            "the dimensions give no single closed bottle",
+        ),
+    ],
+)
 def test_bad_handles_are_refused_by_name(change, message):
     with pytest.raises(InputError, match=r"build_bottle\(\)") as error:
         build_bottle(replace(PLAIN, handle=True, **change))
     assert message in str(error.value)
 
 
-@pytest.mark.parametrize("change", [
-    {"handle_top": 0.3, "handle_thickness": 0.05}, {"cap_radius": 0.0139, "cap_height": 0.0}, {"mouth_depth": 0.3},
-])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"handle_top": 0.3, "handle_thickness": 0.05},
+        {"cap_radius": 0.0139, "cap_height": 0.0},
+        {"mouth_depth": 0.3},
+    ],
+)
 def test_dimensions_of_parts_a_bottle_does_not_have_do_not_matter(change):
     mesh = build_bottle(replace(PLAIN, **change)).mesh
     np.testing.assert_allclose(mesh.bounds[1, 0], PLAIN.radius, atol=1e-6)
     assert mesh.euler_number == 2
 
 
-@pytest.mark.parametrize("change", [
-    {"aspect": 0.35, "neck_radius": 0.011}, {"squareness": 20.0}, {"shoulder_curve": 4.0}, {"neck_taper": 0.5}, {"cap_taper": 0.3}, {"cap_taper": 1.1},
-    {"cap_height": 0.0489}, {"bulge": 0.0107}, {"bulge": -0.0107}, {"edge_radius": 0.0323}, {"neck_radius": 0.0324, "cap_radius": 0.0324},
-    {"cap_height": 0.0, "mouth_depth": 0.0809}, {"shoulder_top": 0.1301}, {"handle": True, "handle_bottom": 0.0155},
-])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"aspect": 0.35, "neck_radius": 0.011},
+        {"squareness": 20.0},
+        {"shoulder_curve": 4.0},
+        {"neck_taper": 0.5},
+        {"cap_taper": 0.3},
+        {"cap_taper": 1.1},
+        {"cap_height": 0.0489},
+        {"bulge": 0.0107},
+        {"bulge": -0.0107},
+        {"edge_radius": 0.0323},
+        {"neck_radius": 0.0324, "cap_radius": 0.0324},
+        {"cap_height": 0.0, "mouth_depth": 0.0809},
+        {"shoulder_top": 0.1301},
+        {"handle": True, "handle_bottom": 0.0155},
+    ],
+)
 def test_dimensions_at_the_ends_of_their_ranges_are_built(change):
     bottle = build_bottle(replace(PLAIN, **change))
     assert bottle.mesh.is_watertight and bottle.mesh.body_count == 1

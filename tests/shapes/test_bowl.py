@@ -77,7 +77,9 @@ def test_the_wall_is_as_thick_as_asked_across_it(name):
     inward = np.stack([-np.ones_like(slope), np.zeros_like(slope), slope], axis=1) / np.hypot(1, slope)[:, None]
     surface = np.stack([radius, np.zeros_like(radius), levels - p.height / 2], axis=1)
     for share, clay in ((0.02, True), (0.5, True), (0.97, True), (1.03, False), (1.5, False)):
-        np.testing.assert_array_equal(bowl.contains(surface + share * p.wall_thickness * inward), clay, err_msg=f"{share}")
+        np.testing.assert_array_equal(
+            bowl.contains(surface + share * p.wall_thickness * inward), clay, err_msg=f"{share}"
+        )
 
 
 @pytest.mark.parametrize("change", [
@@ -223,47 +225,60 @@ def test_sampled_bowls_are_built_and_have_every_symmetry():
 # ---- bad input ----
 
 
-@pytest.mark.parametrize("change, message", [
-    ({"height": -0.1}, "height is -0.1; expected a positive number"),
-    ({"height": 0.0}, "height is 0.0; expected a positive number"),
-    ({"height": "tall"}, "height is 'tall'; expected a finite number"),
-    ({"radius": float("nan")}, "radius is nan; expected a finite number"),
-    ({"radius": float("inf")}, "radius is inf"),
-    ({"wall_thickness": 0.0}, "wall_thickness is 0.0"),
-    ({"bottom_thickness": 0.0}, "bottom_thickness is 0.0"),
-    ({"base_radius": -0.01}, "base_radius is -0.01"),
-    ({"foot_height": -0.001}, "foot_height is -0.001; expected zero or a positive number"),
-    ({"foot_width": 0.0}, "foot_width is 0.0"),
-    ({"lip_radius": -0.001}, "lip_radius is -0.001"),
-    ({"aspect": 0.39}, "aspect is 0.39; expected 0.4 to 1"),
-    ({"aspect": 1.01}, "aspect is 1.01"),
-    ({"squareness": 1.9}, "squareness is 1.9; expected 2 (round) to 20 (square)"),
-    ({"squareness": 21.0}, "squareness is 21.0"),
-    ({"curve": 0.9}, "curve is 0.9; expected 1 to 6"),
-    ({"curve": 6.1}, "curve is 6.1"),
-    ({"rim_flare": float("nan")}, "rim_flare is nan"),
-    ({"rim_flare": 0.019}, "rim_flare must be less than a quarter of radius"),
-    ({"rim_flare": -0.019}, "rim_flare must be less than a quarter of radius"),
-    ({"rim_flare": -0.018, "base_radius": 0.054}, "base_radius leaves no room"),
-    ({"base_radius": 0.072}, "base_radius must be less than 0.95 of radius"),
-    ({"base_radius": 0.0711}, "base_radius leaves no room for the wall"),
-    ({"lip_radius": 0.002}, "lip_radius must be less than half of wall_thickness"),
-    ({"bottom_thickness": 0.035}, "the bottom is too thick for the height"),
-    ({"foot_height": 0.030}, "the bottom is too thick for the height"),
-    ({"foot_height": 0.003, "foot_width": 0.029}, "foot_width leaves no recess"),
-    ({"wall_thickness": 0.019}, "wall_thickness must be less than a quarter of the smaller radius"),
-    ({"wall_thickness": 0.012, "aspect": 0.6}, "wall_thickness must be less than a quarter of the smaller radius"),
-])
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"height": -0.1}, "height is -0.1; expected a positive number"),
+        ({"height": 0.0}, "height is 0.0; expected a positive number"),
+        ({"height": "tall"}, "height is 'tall'; expected a finite number"),
+        ({"radius": float("nan")}, "radius is nan; expected a finite number"),
+        ({"radius": float("inf")}, "radius is inf"),
+        ({"wall_thickness": 0.0}, "wall_thickness is 0.0"),
+        ({"bottom_thickness": 0.0}, "bottom_thickness is 0.0"),
+        ({"base_radius": -0.01}, "base_radius is -0.01"),
+        ({"foot_height": -0.001}, "foot_height is -0.001; expected zero or a positive number"),
+        ({"foot_width": 0.0}, "foot_width is 0.0"),
+        ({"lip_radius": -0.001}, "lip_radius is -0.001"),
+        ({"aspect": 0.39}, "aspect is 0.39; expected 0.4 to 1"),
+        ({"aspect": 1.01}, "aspect is 1.01"),
+        ({"squareness": 1.9}, "squareness is 1.9; expected 2 (round) to 20 (square)"),
+        ({"squareness": 21.0}, "squareness is 21.0"),
+        ({"curve": 0.9}, "curve is 0.9; expected 1 to 6"),
+        ({"curve": 6.1}, "curve is 6.1"),
+        ({"rim_flare": float("nan")}, "rim_flare is nan"),
+        ({"rim_flare": 0.019}, "rim_flare must be less than a quarter of radius"),
+        ({"rim_flare": -0.019}, "rim_flare must be less than a quarter of radius"),
+        ({"rim_flare": -0.018, "base_radius": 0.054}, "base_radius leaves no room"),
+        ({"base_radius": 0.072}, "base_radius must be less than 0.95 of radius"),
+        ({"base_radius": 0.0711}, "base_radius leaves no room for the wall"),
+        ({"lip_radius": 0.002}, "lip_radius must be less than half of wall_thickness"),
+        ({"bottom_thickness": 0.035}, "the bottom is too thick for the height"),
+        ({"foot_height": 0.030}, "the bottom is too thick for the height"),
+        ({"foot_height": 0.003, "foot_width": 0.029}, "foot_width leaves no recess"),
+        ({"wall_thickness": 0.019}, "wall_thickness must be less than a quarter of the smaller radius"),
+        ({"wall_thickness": 0.012, "aspect": 0.6}, "wall_thickness must be less than a quarter of the smaller radius"),
+    ],
+)
 def test_bad_dimensions_are_refused_by_name(change, message):
     with pytest.raises(InputError, match=r"build_bowl\(\)") as error:
         build_bowl(replace(PLAIN, **change))
     assert message in str(error.value)
 
 
-@pytest.mark.parametrize("change", [
-    {"aspect": 0.4}, {"squareness": 20.0}, {"curve": 6.0}, {"rim_flare": 0.0187}, {"rim_flare": -0.0187, "lip_radius": 0.0},
-    {"base_radius": 0.0709}, {"wall_thickness": 0.0187}, {"foot_height": 0.003, "foot_width": 0.0287}, {"bottom_thickness": 0.001},
-])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"aspect": 0.4},
+        {"squareness": 20.0},
+        {"curve": 6.0},
+        {"rim_flare": 0.0187},
+        {"rim_flare": -0.0187, "lip_radius": 0.0},
+        {"base_radius": 0.0709},
+        {"wall_thickness": 0.0187},
+        {"foot_height": 0.003, "foot_width": 0.0287},
+        {"bottom_thickness": 0.001},
+    ],
+)
 def test_dimensions_at_the_ends_of_their_ranges_are_built(change):
     mesh = build_bowl(replace(PLAIN, **change)).mesh
     assert mesh.is_watertight and mesh.body_count == 1 and mesh.euler_number == 2

@@ -78,7 +78,11 @@ def assert_one_closed_cup(mesh):
 def test_a_demonstration_picks_a_mug_at_its_handle_a_bowl_at_its_rim_and_a_bottle_at_its_neck():
     """The order is that of the places in data sets, too."""
     places = {category: family.places for category, family in FAMILIES.items()}
-    assert places == {"mug": ("handle", "rim", "base"), "bowl": ("rim", "base", "body"), "bottle": ("neck", "base", "body")}
+    assert places == {
+        "mug": ("handle", "rim", "base"),
+        "bowl": ("rim", "base", "body"),
+        "bottle": ("neck", "base", "body"),
+    }
 
 
 @pytest.mark.parametrize("category", FAMILIES)
@@ -88,7 +92,9 @@ def test_a_family_builds_its_category_with_its_places_in_a_frame_that_stands_upr
     for seed in range(4):
         shape = sampled(seed, category)
         assert shape.category == category and shape.height == shape.parameters.height
-        assert_one_closed_body(shape.mesh, holes={"mug": 1, "bowl": 0, "bottle": int(getattr(shape.parameters, "handle", False))}[category])
+        assert_one_closed_body(
+            shape.mesh, holes={"mug": 1, "bowl": 0, "bottle": int(getattr(shape.parameters, "handle", False))}[category]
+        )
         np.testing.assert_allclose(shape.mesh.bounds[0, 2], -shape.height / 2, atol=1e-6)
         np.testing.assert_array_equal(shape.axis, [0, 0, 1])
         assert len(family.places) == 3 and set(shape.frames) == set(family.places)
@@ -115,7 +121,9 @@ def test_contains_of_every_family_agrees_with_the_winding_number_of_the_mesh(cat
 @pytest.mark.parametrize("category, seed", [(category, seed) for category in OTHERS for seed in range(8)])
 def test_contains_of_every_family_switches_at_the_surface(category, seed):
     shape = sampled(200 + seed, category)
-    same_shape_all_the_way_up = category == "bowl" or (shape.parameters.aspect == 1 and shape.parameters.squareness == 2)
+    same_shape_all_the_way_up = category == "bowl" or (
+        shape.parameters.aspect == 1 and shape.parameters.squareness == 2
+    )
     step = 1e-6 if same_shape_all_the_way_up and not getattr(shape.parameters, "handle", False) else 1e-4
     points, normals = surface_samples(shape.mesh, np.random.default_rng(seed), 3000)
     wrong = ~shape.contains(points - step * normals) | shape.contains(points + step * normals)
@@ -389,31 +397,34 @@ def test_scaled_scales_mesh_frames_parameters_and_contains():
     assert_one_closed_cup(scaled(mug, 25.0).mesh)
 
 
-@pytest.mark.parametrize("change, message", [
-    ({"height": -0.1}, "height is -0.1"),
-    ({"height": 0.0}, "height is 0.0"),
-    ({"top_radius": float("nan")}, "top_radius is nan"),
-    ({"height": "tall"}, "height is 'tall'"),
-    ({"foot_height": -0.001}, "foot_height is -0.001"),
-    ({"wall_thickness": 0.041}, "wall_thickness must be less than the radius"),
-    ({"wall_thickness": 0.03, "edge_radius": 0.0}, "the cavity closes at its floor"),
-    ({"bulge": -0.05}, "wall_thickness must be less than the radius"),
-    ({"bottom_thickness": 0.12}, "bottom is too thick"),
-    ({"edge_radius": 0.039}, "edge_radius"),
-    ({"foot_height": 0.003, "foot_width": 0.04}, "no recess"),
-    ({"lip_radius": 0.003}, "lip_radius"),
-    ({"squareness": 1.0}, "squareness is 1.0"),
-    ({"handle_squareness": 50.0}, "handle_squareness is 50.0"),
-    ({"handle_flare": 0.5}, "handle_flare is 0.5"),
-    ({"handle_style": "loop"}, "handle_style is 'loop'"),
-    ({"handle_top": 0.11}, "handle_top is above the body"),
-    ({"handle_bottom": 0.002}, "handle_bottom is below the body"),
-    ({"handle_bottom": 0.07}, "too close"),
-    ({"handle_reach": 0.001}, "handle"),
-    ({"handle_width": 0.06}, "handle_width"),
-    ({"handle_reach": 0.0055}, "finger hole"),
-    ({"handle_style": "ring", "handle_bottom": 0.009}, "hangs below"),
-])
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"height": -0.1}, "height is -0.1"),
+        ({"height": 0.0}, "height is 0.0"),
+        ({"top_radius": float("nan")}, "top_radius is nan"),
+        ({"height": "tall"}, "height is 'tall'"),
+        ({"foot_height": -0.001}, "foot_height is -0.001"),
+        ({"wall_thickness": 0.041}, "wall_thickness must be less than the radius"),
+        ({"wall_thickness": 0.03, "edge_radius": 0.0}, "the cavity closes at its floor"),
+        ({"bulge": -0.05}, "wall_thickness must be less than the radius"),
+        ({"bottom_thickness": 0.12}, "bottom is too thick"),
+        ({"edge_radius": 0.039}, "edge_radius"),
+        ({"foot_height": 0.003, "foot_width": 0.04}, "no recess"),
+        ({"lip_radius": 0.003}, "lip_radius"),
+        ({"squareness": 1.0}, "squareness is 1.0"),
+        ({"handle_squareness": 50.0}, "handle_squareness is 50.0"),
+        ({"handle_flare": 0.5}, "handle_flare is 0.5"),
+        ({"handle_style": "loop"}, "handle_style is 'loop'"),
+        ({"handle_top": 0.11}, "handle_top is above the body"),
+        ({"handle_bottom": 0.002}, "handle_bottom is below the body"),
+        ({"handle_bottom": 0.07}, "too close"),
+        ({"handle_reach": 0.001}, "handle"),
+        ({"handle_width": 0.06}, "handle_width"),
+        ({"handle_reach": 0.0055}, "finger hole"),
+        ({"handle_style": "ring", "handle_bottom": 0.009}, "hangs below"),
+    ],
+)
 def test_bad_dimensions_are_refused_by_name(change, message):
     with pytest.raises(InputError, match=r"build_mug\(\)") as error:
         build_mug(replace(MugParameters(), **change))

@@ -223,7 +223,10 @@ def test_a_start_that_becomes_non_finite_is_reported_and_the_others_are_unaffect
         np.testing.assert_array_equal(far.trajectories[::2], result.trajectories[::2])
         np.testing.assert_array_equal(far.losses[::2], result.losses[::2])
         lost = run(field, reference, starts=result.starts.at[:, 0, 4].set(1e30))
-        with pytest.raises(InputError, match="3 of 3 starts became non-finite: 0, 1, 2; check the weights and the query points, or, with Adam, lower rotation_rate and translation_rate"):
+        with pytest.raises(
+            InputError,
+            match="3 of 3 starts became non-finite: 0, 1, 2; check the weights and the query points, or, with Adam, lower rotation_rate and translation_rate",
+        ):
             _ = lost.trajectory
 
 

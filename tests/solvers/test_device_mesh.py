@@ -58,10 +58,14 @@ print('equal')
 def processes(tmp_path, devices, arguments):
     script = tmp_path / "devices.py"
     script.write_text(SCRIPT)
-    environment = os.environ | {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}", "JAX_PLATFORMS": "cpu"}
+    environment = os.environ | {
+        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+        "JAX_PLATFORMS": "cpu",
+    }
     command = [sys.executable, str(script), os.path.dirname(os.path.dirname(__file__))]
     running = [
-        subprocess.Popen([*command, *more], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for more in arguments
+        subprocess.Popen([*command, *more], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        for more in arguments
     ]
     return [(one.communicate(timeout=300), one.returncode) for one in running]
 

@@ -36,7 +36,9 @@ def result(field, reference):
 
 
 def energy_of(trajectories, field, reference, weights=WEIGHTS):
-    return np.array([tdf.trajectory_energy(tdf.Trajectory(wxyz_xyz), field, reference, weights) for wxyz_xyz in trajectories])
+    return np.array(
+        [tdf.trajectory_energy(tdf.Trajectory(wxyz_xyz), field, reference, weights) for wxyz_xyz in trajectories]
+    )
 
 
 # ---- the quadratic model ----
@@ -72,14 +74,19 @@ def test_energies_and_gradients_are_those_of_the_energy(field, reference, pose_n
 
 def test_the_curvature_is_that_of_reweighted_squares(field, reference):
     problem = solve._problem(KEY, reference, 8)
-    R, place = (jnp.asarray(part[0, :1]) for part in solve._candidates(random_starts(KEY, field, reference, 1, "scattered", 0.1), problem)[:2])
+    R, place = (
+        jnp.asarray(part[0, :1])
+        for part in solve._candidates(random_starts(KEY, field, reference, 1, "scattered", 0.1), problem)[:2]
+    )
     shown = problem.descriptors[:1, 0]
 
     def residual(step):
         turned, centre = moved(R[0], place[0], step)
         return field.descriptors(problem.query[0] @ turned.T + centre) - shown[0]
 
-    value, jacobian = (np.asarray(part, np.float64) for part in (residual(jnp.zeros(6)), jax.jacfwd(residual)(jnp.zeros(6))))
+    value, jacobian = (
+        np.asarray(part, np.float64) for part in (residual(jnp.zeros(6)), jax.jacfwd(residual)(jnp.zeros(6)))
+    )
     size = np.abs(value)
     weights = 1 / np.maximum(size, size.mean(axis=-1, keepdims=True)) / value.size
     expected = np.einsum("qca,qc,qcb->ab", jacobian, weights, jacobian)
@@ -91,7 +98,9 @@ def test_a_step_solves_the_damped_system_and_is_bounded():
     rng = np.random.default_rng(0)
     half = rng.normal(size=(4, 6, 6))
     hessian, gradient = half @ half.swapaxes(1, 2) + np.eye(6), 1e-3 * rng.normal(size=(4, 6))
-    state = descent._State(jnp.zeros((4, 3, 3)), jnp.zeros((4, 3)), jnp.ones(4), jnp.float32(gradient), jnp.float32(hessian))
+    state = descent._State(
+        jnp.zeros((4, 3, 3)), jnp.zeros((4, 3)), jnp.ones(4), jnp.float32(gradient), jnp.float32(hessian)
+    )
     damping = jnp.array([0.1, 1.0, 0.0, 10.0])
     step, promise = descent._step(state, damping)
     damped = hessian + np.asarray(damping)[:, None, None] * hessian * np.eye(6)
@@ -109,7 +118,15 @@ def test_a_step_solves_the_damped_system_and_is_bounded():
 def test_chunks_do_not_show(field, reference):
     problem = solve._problem(KEY, reference, 3)
     drawn = solve._candidates(random_starts(KEY, field, reference, 2, "carried", 0.1), problem)
-    settings = (drawn.R.reshape(-1, 3, 3), drawn.place.reshape(-1, 3), np.tile(np.arange(4), 2), np.array([8, 8, 3, 0]), field, problem, WEIGHTS)
+    settings = (
+        drawn.R.reshape(-1, 3, 3),
+        drawn.place.reshape(-1, 3),
+        np.tile(np.arange(4), 2),
+        np.array([8, 8, 3, 0]),
+        field,
+        problem,
+        WEIGHTS,
+    )
     # 3 poses at a time: the last chunk overlaps the one before.
     for part, expected in zip(descent._evaluate(*settings, 9), descent._evaluate(*settings, 128), strict=True):
         np.testing.assert_allclose(part, expected, rtol=1e-4, atol=1e-6)
@@ -129,9 +146,14 @@ def test_carried_candidates_are_rigid_motions_of_the_demonstration(field, refere
     new = np.array(solve._poses(solve._carried(found, picked, 1, shown_candidates, field.origin), problem), np.float64)
     assert new.shape == (6, 3, 7)
     shown = np.array(reference.trajectory.shifted(field.origin).wxyz_xyz[:3], np.float64)
-    for index, (row, waypoint) in enumerate([*((row, waypoint) for waypoint, row in enumerate(energy.argmin(axis=0))), (2, 1), (3, 1)]):
+    for index, (row, waypoint) in enumerate(
+        [*((row, waypoint) for waypoint, row in enumerate(energy.argmin(axis=0))), (2, 1), (3, 1)]
+    ):
         best = np.array(starts[row, waypoint], np.float64)
-        turn = Rotation.from_quat(best[:4], scalar_first=True) * Rotation.from_quat(shown[waypoint, :4], scalar_first=True).inv()
+        turn = (
+            Rotation.from_quat(best[:4], scalar_first=True)
+            * Rotation.from_quat(shown[waypoint, :4], scalar_first=True).inv()
+        )
         motion = np.concatenate([turn.as_quat(scalar_first=True), best[4:] - turn.apply(shown[waypoint, 4:])])
         expected = composed(motion, shown)
         expected *= np.where(np.arange(7) < 4, np.sign((expected[:, :4] * new[index, :, :4]).sum(axis=1))[:, None], 1)
@@ -176,7 +198,10 @@ def test_the_last_pose_is_fixed_at_the_goal_exactly(field, reference, result):
 
 def test_a_free_last_pose_moves_and_energies_are_of_all_poses(field, reference):
     weights = tdf.EnergyWeights(0.0)  # at the goal, eq. 3 alone is least
-    free, fixed = (run(field, reference, config=SolveConfig(points=8), energy=weights, fix_last=fix_last) for fix_last in (False, True))
+    free, fixed = (
+        run(field, reference, config=SolveConfig(points=8), energy=weights, fix_last=fix_last)
+        for fix_last in (False, True)
+    )
     np.testing.assert_allclose(free.energies, energy_of(free.trajectories, field, reference, weights), rtol=1e-5)
     assert np.abs(free.trajectories[0, -1] - fixed.trajectories[0, -1]).max() > 1e-3
     assert free.loss < fixed.loss
@@ -186,8 +211,22 @@ def test_it_reaches_what_adam_reaches(field, reference):
     """On random networks minima are many: 20 starts each, of both kinds."""
     for start in ("carried", "scattered"):
         starts = random_starts(KEY, field, reference, 20, start, 0.1)
-        adam = tdf.optimize(field, reference, KEY, energy=WEIGHTS, config=tdf.OptimizeConfig(20, 100), starts=starts, goal=default_goal(field, reference))
-        found = run(field, reference, starts=starts, goal=default_goal(field, reference), config=SolveConfig(points=8, steps=(30,) * 6, tolerance=0.0))
+        adam = tdf.optimize(
+            field,
+            reference,
+            KEY,
+            energy=WEIGHTS,
+            config=tdf.OptimizeConfig(20, 100),
+            starts=starts,
+            goal=default_goal(field, reference),
+        )
+        found = run(
+            field,
+            reference,
+            starts=starts,
+            goal=default_goal(field, reference),
+            config=SolveConfig(points=8, steps=(30,) * 6, tolerance=0.0),
+        )
         assert found.loss < 1.02 * adam.loss
 
 
@@ -202,7 +241,12 @@ def test_a_known_pose_is_found_on_the_same_object(golden, quick_compilation):
     truth = composed(motion, demonstrated)
     field = tdf.encode(golden.model, carried(motion, points).astype(np.float32))
     result = tdf.solve(
-        field, reference, KEY, goal=jnp.asarray(truth[-1], jnp.float32), energy=tdf.EnergyWeights(correlation=0.0), config=SolveConfig()
+        field,
+        reference,
+        KEY,
+        goal=jnp.asarray(truth[-1], jnp.float32),
+        energy=tdf.EnergyWeights(correlation=0.0),
+        config=SolveConfig(),
     )
     pick = np.array(result.trajectory.wxyz_xyz[0], np.float64)
     turn = Rotation.from_quat(pick[:4], scalar_first=True) * Rotation.from_quat(truth[0, :4], scalar_first=True).inv()
@@ -284,7 +328,9 @@ def test_what_couples_waypoints_is_refused(field, reference):
     starts = jnp.asarray(np.stack([random_poses(seed, 4) for seed in range(3)]), jnp.float32)
     with pytest.raises(InputError, match="the last poses of the starts differ"):
         run(field, reference, starts=starts)
-    one = dataclasses.replace(reference, descriptors=reference.descriptors[:1], trajectory=tdf.Trajectory(reference.trajectory.wxyz_xyz[:1]))
+    one = dataclasses.replace(
+        reference, descriptors=reference.descriptors[:1], trajectory=tdf.Trajectory(reference.trajectory.wxyz_xyz[:1])
+    )
     with pytest.raises(InputError, match="expected fix_last=False"):
         run(field, one)
     with pytest.raises(InputError, match=r"solve\(\): key is 0"):
@@ -294,7 +340,9 @@ def test_what_couples_waypoints_is_refused(field, reference):
 
 
 def test_one_pose_alone_is_found(field, reference):
-    one = dataclasses.replace(reference, descriptors=reference.descriptors[:1], trajectory=tdf.Trajectory(reference.trajectory.wxyz_xyz[:1]))
+    one = dataclasses.replace(
+        reference, descriptors=reference.descriptors[:1], trajectory=tdf.Trajectory(reference.trajectory.wxyz_xyz[:1])
+    )
     result = run(field, one, fix_last=False)
     assert result.trajectories.shape == (2, 1, 7)
     np.testing.assert_allclose(result.energies, energy_of(result.trajectories, field, one), rtol=1e-5)

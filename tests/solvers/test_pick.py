@@ -113,7 +113,9 @@ def result(field, reference):
 @pytest.fixture(scope="module")
 def picked(field, reference):
     """The pick alone, by the solver."""
-    alone = dataclasses.replace(reference, descriptors=reference.descriptors[:1], trajectory=tdf.Trajectory(reference.trajectory.wxyz_xyz[:1]))
+    alone = dataclasses.replace(
+        reference, descriptors=reference.descriptors[:1], trajectory=tdf.Trajectory(reference.trajectory.wxyz_xyz[:1])
+    )
     return alone, tdf.solve(field, alone, KEY, fix_last=False, energy=tdf.EnergyWeights(0.0), config=CONFIG.solver)
 
 
@@ -143,7 +145,9 @@ def test_a_goal_is_where_it_ends_and_without_one_it_is_carried_rigidly(field, re
         tdf.carry(field, reference, KEY, goal=goal, fix_last=False, config=CONFIG)
     free = tdf.carry(field, reference, KEY, fix_last=False, config=CONFIG).trajectory
     motion = motion_of(free.wxyz_xyz[0], reference.trajectory.wxyz_xyz[0])
-    np.testing.assert_allclose(free.translations, motion[0].apply(np.array(reference.trajectory.translations, float)) + motion[1], atol=1e-5)
+    np.testing.assert_allclose(
+        free.translations, motion[0].apply(np.array(reference.trajectory.translations, float)) + motion[1], atol=1e-5
+    )
 
 
 def test_the_residual_is_that_of_the_best_pick(result, picked):
@@ -175,7 +179,9 @@ def test_bad_input_is_refused(field, reference, settings, words):
 
 
 def test_one_pose_that_is_kept_leaves_nothing_to_find(field, reference):
-    one = dataclasses.replace(reference, descriptors=reference.descriptors[:1], trajectory=tdf.Trajectory(reference.trajectory.wxyz_xyz[:1]))
+    one = dataclasses.replace(
+        reference, descriptors=reference.descriptors[:1], trajectory=tdf.Trajectory(reference.trajectory.wxyz_xyz[:1])
+    )
     with pytest.raises(InputError, match="fix_last=False"):
         tdf.carry(field, one, KEY)
 
@@ -214,4 +220,11 @@ def test_imitate_carries_unless_told_otherwise(small_model, demonstration, refer
     found = tdf.imitate(small_model, demonstration, random_cloud(3).astype(np.float32), key=KEY, config=CONFIG)
     np.testing.assert_array_equal(found.trajectories, result.trajectories)
     with pytest.raises(InputError, match="energy is given"):
-        tdf.imitate(small_model, reference, random_cloud(3).astype(np.float32), key=KEY, config=CONFIG, energy=tdf.EnergyWeights())
+        tdf.imitate(
+            small_model,
+            reference,
+            random_cloud(3).astype(np.float32),
+            key=KEY,
+            config=CONFIG,
+            energy=tdf.EnergyWeights(),
+        )

@@ -55,7 +55,15 @@ def test_batches_are_a_function_of_the_generator(objects):
         assert getattr(first, field.name).dtype == np.float32
     assert not np.array_equal(first.clouds, other.clouds)
     shapes = [getattr(first, field.name).shape for field in dataclasses.fields(first)]
-    assert shapes == [(3, 2, 200, 3), (3, 2, 50, 3), (3, 2, 50), (3, 2, 3), (3, 2), (3, 2, 12, 3), (3, 2, batch.QUARTERS + 5, 12, 3)]
+    assert shapes == [
+        (3, 2, 200, 3),
+        (3, 2, 50, 3),
+        (3, 2, 50),
+        (3, 2, 3),
+        (3, 2),
+        (3, 2, 12, 3),
+        (3, 2, batch.QUARTERS + 5, 12, 3),
+    ]
 
 
 def test_everything_of_an_object_is_scaled_and_centred_together(objects):
@@ -128,7 +136,9 @@ def test_some_clouds_have_points_astray(objects, monkeypatch):
 
 
 def test_validation_pairs_show_every_object_once_at_one_size(objects):
-    objects = dataclasses.replace(objects, **{f.name: getattr(objects, f.name)[:2] for f in dataclasses.fields(objects)})
+    objects = dataclasses.replace(
+        objects, **{f.name: getattr(objects, f.name)[:2] for f in dataclasses.fields(objects)}
+    )
     full, view = (validation_pairs(objects, 100, 12, 6, one_view)[0] for one_view in (False, True))
     assert full.queries.shape == (2, 500, 3)
     np.testing.assert_array_equal(full.inside, objects.inside[:, :500])
@@ -190,7 +200,9 @@ def test_kinds_of_a_source_are_drawn_alike_however_many_objects_they_have(object
     np.testing.assert_allclose(numbers, expected, atol=0.07)  # four standard deviations
 
 
-@pytest.mark.parametrize(("fold", "turns"), [(0, (0, 90, 180, 270)), (1, (0, 0, 0, 0)), (2, (0, 0, 180, 0)), (4, (0, 90, 180, 270))])
+@pytest.mark.parametrize(
+    ("fold", "turns"), [(0, (0, 90, 180, 270)), (1, (0, 0, 0, 0)), (2, (0, 0, 180, 0)), (4, (0, 90, 180, 270))]
+)
 def test_the_right_pose_is_offered_at_every_quarter_turn_that_a_symmetry_allows(objects, fold, turns):
     """About the object's own axis, which a cloud seen from one side does not have its mean on."""
     data = many(objects, [fold] * 3, [0] * 3)

@@ -44,7 +44,9 @@ def meshes(tmp_path):
     turn = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])  # canonical axes to the file's
     for index in range(4):
         mesh = build_mug(sample_mug(np.random.default_rng([6, index]))).mesh
-        mesh = trimesh.Trimesh(1000 * mesh.vertices @ turn.T + 7.0, mesh.faces[: -3 if index == 0 else None], process=False)
+        mesh = trimesh.Trimesh(
+            1000 * mesh.vertices @ turn.T + 7.0, mesh.faces[: -3 if index == 0 else None], process=False
+        )
         mesh.export(folder / f"mug{index}.obj")
     (folder / "notes.txt").write_text("not a mesh")
     return folder
@@ -115,7 +117,9 @@ def test_a_scanned_mesh_is_labelled_as_the_exact_solid_is(meshes):
 def test_places_of_a_scanned_mesh_are_its_box_and_stretch_with_it(meshes):
     pytest.importorskip("igl")
     mesh = canonical_mesh(meshes / "mug1.obj", 0.001, "+y", "-z")
-    plain, stretched = (scanned_object(mesh, np.random.default_rng(3), 4000, 400, 4, stretch=stretch) for stretch in (0.0, 0.3))
+    plain, stretched = (
+        scanned_object(mesh, np.random.default_rng(3), 4000, 400, 4, stretch=stretch) for stretch in (0.0, 0.3)
+    )
     for found in (plain, stretched):
         assert found.places.shape == (7, 4, 4)
         np.testing.assert_allclose(found.places[:, :3, 3].max(axis=0), found.surface.max(axis=0), atol=0.01)
@@ -126,7 +130,16 @@ def test_places_of_a_scanned_mesh_are_its_box_and_stretch_with_it(meshes):
 
 @pytest.mark.parametrize(
     "category, seed, fold",
-    [("mug", 0, 1), ("bowl", 0, 2), ("bowl", 1, 0), ("bowl", 18, 4), ("bottle", 0, 2), ("bottle", 1, 0), ("bottle", 3, 1), ("bottle", 12, 4)],
+    [
+        ("mug", 0, 1),
+        ("bowl", 0, 2),
+        ("bowl", 1, 0),
+        ("bowl", 18, 4),
+        ("bottle", 0, 2),
+        ("bottle", 1, 0),
+        ("bottle", 3, 1),
+        ("bottle", 12, 4),
+    ],
 )
 def test_objects_of_every_family_have_its_places_in_order_and_their_own_symmetry(category, seed, fold):
     found = generated_object(category, np.random.default_rng([5, seed]), points=100, queries=100, cameras=4)
@@ -206,7 +219,11 @@ def test_an_interrupted_build_goes_on_to_the_same_data_set(tmp_path, monkeypatch
     monkeypatch.setattr(dataset, "_label", killed_at_4)
     with pytest.raises(KeyboardInterrupt):
         quiet_build(RECIPE, tmp_path / "cut")
-    assert sorted(path.name for path in (tmp_path / "cut").iterdir()) == ["dataset.json", "training-0000.npz", "training-0001.npz"]
+    assert sorted(path.name for path in (tmp_path / "cut").iterdir()) == [
+        "dataset.json",
+        "training-0000.npz",
+        "training-0001.npz",
+    ]
     with pytest.raises(InputError, match=r"no training-0002.npz; the data set is not finished: run its tdf dataset"):
         load(tmp_path / "cut")
     before = (tmp_path / "cut" / "training-0000.npz").stat().st_mtime_ns
@@ -351,7 +368,10 @@ def test_one_data_set_joined_is_itself():
 
 
 def test_data_sets_with_other_counts_are_not_joined():
-    with pytest.raises(InputError, match=r"joined\(\): the data sets differ in places; expected as many points, queries, cameras and places"):
+    with pytest.raises(
+        InputError,
+        match=r"joined\(\): the data sets differ in places; expected as many points, queries, cameras and places",
+    ):
         joined([some([1, 1]), some([0, 0], places=7)])
     fewer = some([1, 1])
     fewer = dataclasses.replace(fewer, surface=fewer.surface[:, :5], visible=fewer.visible[:, :, :5])
@@ -418,7 +438,9 @@ def test_other_recipes_and_damaged_files_are_refused(tmp_path):
         quiet_build(dataclasses.replace(RECIPE, seed=6, points=300), tmp_path / "data")
     shard = tmp_path / "data" / "training-0001.npz"
     shard.write_bytes(shard.read_bytes()[:1000])
-    with pytest.raises(InputError, match=r"training-0001.npz cannot be read .*delete that file and run the tdf dataset command again"):
+    with pytest.raises(
+        InputError, match=r"training-0001.npz cannot be read .*delete that file and run the tdf dataset command again"
+    ):
         load(tmp_path / "data")
     shard.unlink()
     quiet_build(RECIPE, tmp_path / "data")

@@ -50,7 +50,10 @@ def sets(tmp_path_factory):
 @pytest.fixture(scope="module")
 def two_sets(sets, tmp_path_factory):
     """Of mugs and of bowls that are all round, joined."""
-    bowls = [dataclasses.replace(part, fold=np.zeros_like(part.fold)) for part in built(tmp_path_factory.mktemp("bowls"), "bowl", objects=3)]
+    bowls = [
+        dataclasses.replace(part, fold=np.zeros_like(part.fold))
+        for part in built(tmp_path_factory.mktemp("bowls"), "bowl", objects=3)
+    ]
     return tuple(joined(pair) for pair in zip(sets, bowls, strict=True))
 
 
@@ -63,7 +66,9 @@ def train(sets, quick_compilation):
         patch.setattr("tdf_jax.training.batch.SPARSE_CLOUDS", (40, 300))
         # half a metre is too much for so small a network
         patch.setattr("tdf_jax.training.batch.DIAGONALS", (0.12, 0.25))
-        yield lambda config, directory, data=sets, **options: loop.train(config, *data, directory, progress=False, **options)
+        yield lambda config, directory, data=sets, **options: loop.train(
+            config, *data, directory, progress=False, **options
+        )
 
 
 @pytest.fixture(scope="module")
@@ -194,7 +199,9 @@ def test_data_with_too_few_points_are_refused(train, tmp_path):
 
 
 def test_a_loss_that_is_not_finite_stops_the_run(train, tmp_path, monkeypatch):
-    monkeypatch.setattr(loop, "summary", lambda parts: {"loss": np.nan, "bce": 0.0, "frame": 0.0, "place": 0.0, "iou": 0.0})
+    monkeypatch.setattr(
+        loop, "summary", lambda parts: {"loss": np.nan, "bce": 0.0, "frame": 0.0, "place": 0.0, "iou": 0.0}
+    )
     with pytest.raises(FloatingPointError, match="the loss is nan at step 1; lower the learning rate"):
         train(CONFIG, tmp_path)
     assert not (tmp_path / "state.msgpack").exists()
@@ -238,7 +245,9 @@ def test_minutes_become_steps(sets, monkeypatch):
     monkeypatch.setattr(loop, "_step", lambda params, state, *_: (params, state, None))
     # 0.5 s a step by that clock, nine tenths of the time
     assert loop.steps_within(10, CONFIG, sets[0], 1) == loop.steps_within(10, CONFIG, sets[0]) == 1080
-    with pytest.raises(InputError, match=r"0.01 minutes are enough for 1 steps of 0.50 s; expected time for more than 2"):
+    with pytest.raises(
+        InputError, match=r"0.01 minutes are enough for 1 steps of 0.50 s; expected time for more than 2"
+    ):
         loop.steps_within(0.01, CONFIG, sets[0])
 
 
@@ -254,12 +263,16 @@ def test_curves_show_training_and_both_validations(whole):
         np.testing.assert_allclose(view.get_ydata(), [row["one_view"][name] for row in rows if "one_view" in row])
         assert len(others) == (name == "iou")
         for line in others:
-            np.testing.assert_allclose(line.get_ydata(), [row["transfer"]["success"] for row in rows if "transfer" in row])
+            np.testing.assert_allclose(
+                line.get_ydata(), [row["transfer"]["success"] for row in rows if "transfer" in row]
+            )
 
 
 def test_transfers_of_validation_objects_have_their_truth(sets):
     """An object laid on itself by its place's truth is itself again."""
-    validation = dataclasses.replace(sets[1], **{f.name: getattr(sets[1], f.name)[[0, 0]] for f in dataclasses.fields(sets[1])})
+    validation = dataclasses.replace(
+        sets[1], **{f.name: getattr(sets[1], f.name)[[0, 0]] for f in dataclasses.fields(sets[1])}
+    )
     (transfer,) = loop._transfers(validation)
     T = transfer.T_world_place_b @ np.linalg.inv(transfer.T_world_place_a)
     np.testing.assert_allclose(transfer.points_a @ T[:3, :3].T + T[:3, 3], transfer.points_b, atol=1e-5)
@@ -317,7 +330,9 @@ def test_the_front_is_read_out_of_the_objects_that_have_one():
     np.testing.assert_allclose(some[:, [0, 2]], fitted[:, [0, 2]], atol=1e-6)
     for latent in latents[fold == 1]:
         np.testing.assert_allclose(some[:, 1] @ latent, [1, 0, 0], atol=1e-5)
-    np.testing.assert_allclose(some[:, 1], np.asarray(loop._read_outs(latents[fold == 1], centres[:2], np.ones(2), 0))[:, 1], atol=1e-6)
+    np.testing.assert_allclose(
+        some[:, 1], np.asarray(loop._read_outs(latents[fold == 1], centres[:2], np.ones(2), 0))[:, 1], atol=1e-6
+    )
 
 
 def test_without_an_object_of_one_front_its_read_out_begins_at_random():
@@ -366,7 +381,17 @@ def test_validation_objects_without_another_of_their_kind_are_refused(train, set
 
 @pytest.mark.parametrize(
     "bad",
-    [{"steps": 0}, {"steps": 30}, {"batch": 0}, {"batch": 3}, {"points": 20}, {"points": 2001}, {"queries": 0}, {"poses": 1}, {"seed": -1}]
+    [
+        {"steps": 0},
+        {"steps": 30},
+        {"batch": 0},
+        {"batch": 3},
+        {"points": 20},
+        {"points": 2001},
+        {"queries": 0},
+        {"poses": 1},
+        {"seed": -1},
+    ]
     + [{"learning_rate": float("nan")}, {"corruption": 1.5}, {"save_seconds": -1.0}, {"validate_every": 0}, {"box": 0}],
 )
 def test_bad_settings_are_refused_before_any_work(bad):

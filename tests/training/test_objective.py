@@ -24,7 +24,9 @@ def samples():
     queries, inside, centres = (0.1 * rng.normal(size=(3, 2, *shape)) for shape in shapes.values())
     fold = np.array([[1, 1], [0, 0], [4, 2]])
     shown, offered = 0.1 * rng.normal(size=(3, 2, 5, 3)), 0.1 * rng.normal(size=(3, 2, QUARTERS + 2, 5, 3))
-    return tuple(np.asarray(array, np.float32) for array in (clouds, queries, inside > 0, centres, fold, shown, offered))
+    return tuple(
+        np.asarray(array, np.float32) for array in (clouds, queries, inside > 0, centres, fold, shown, offered)
+    )
 
 
 @pytest.mark.parametrize("asymmetry", [0.0, 0.1])
@@ -36,7 +38,9 @@ def test_a_batch_taken_together_has_the_gradients_of_its_pairs_one_by_one(small_
     for one_by_one in (True, False):
         monkeypatch.setattr(objective, "one_at_a_time", lambda one_by_one=one_by_one: one_by_one)
         # A function of its own, for what is compiled is kept by function.
-        found[one_by_one] = jax.jit(lambda *arguments: mean_gradient(arguments[0], config, *arguments[1:]))(params, *samples)
+        found[one_by_one] = jax.jit(lambda *arguments: mean_gradient(arguments[0], config, *arguments[1:]))(
+            params, *samples
+        )
     for a, b in zip(jax.tree.leaves(found[True]), jax.tree.leaves(found[False]), strict=True):
         assert a.shape == b.shape
         np.testing.assert_allclose(a, b, atol=1e-4 * max(1e-2, np.abs(b).max()))
@@ -60,7 +64,9 @@ def test_of_the_right_poses_of_a_symmetric_object_the_best_counts():
     turns = [near @ about_z(quarter * np.pi / 2)[:3, :3].T for quarter in range(QUARTERS)]
     for first in range(QUARTERS):
         offered = np.concatenate([np.roll(turns, first, axis=0), wrong]).astype(np.float32)
-        np.testing.assert_allclose(place_error(Field(), Field(), jnp.asarray(shown, jnp.float32), offered), expected[0], rtol=1e-3)
+        np.testing.assert_allclose(
+            place_error(Field(), Field(), jnp.asarray(shown, jnp.float32), offered), expected[0], rtol=1e-3
+        )
     # A wrong pose there is no right one, however near.
     offered = np.concatenate([turns[2:3] * QUARTERS, near[None], wrong]).astype(np.float32)
     assert place_error(Field(), Field(), jnp.asarray(shown, jnp.float32), offered) > expected[0] + 0.5

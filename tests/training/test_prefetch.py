@@ -52,7 +52,9 @@ def test_batches_come_in_the_order_of_steps_and_do_not_depend_on_who_draws_them(
     batch = functools.partial(batch_of, CONFIG, gradual=False)
     with drawn_ahead(batch, data, 5, workers) as batches:
         for step in range(5, 5 + 2 * ahead.AHEAD * workers + 1):
-            for found, expected in zip(dataclasses.astuple(next(batches)), dataclasses.astuple(batch(data, step)), strict=True):
+            for found, expected in zip(
+                dataclasses.astuple(next(batches)), dataclasses.astuple(batch(data, step)), strict=True
+            ):
                 np.testing.assert_array_equal(found, expected)
                 assert found.dtype == expected.dtype
 

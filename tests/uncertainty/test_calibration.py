@@ -79,7 +79,10 @@ def test_shipped_weights_judge_the_object_and_others_do_not(small_model, monkeyp
         warnings.simplefilter("error")
         assert found("mine", (0.0, 0.0, 0.0))[1].recognised is None
         assert found("mug", (2.0, 0.0, 0.0))[1].recognised == pytest.approx(1 / (1 + np.exp(-2)))
-    with pytest.warns(tdf.CategoryWarning, match=r"does not look like one of the demonstration's category to the weights 'mug' \(probability 0.12\)"):
+    with pytest.warns(
+        tdf.CategoryWarning,
+        match=r"does not look like one of the demonstration's category to the weights 'mug' \(probability 0.12\)",
+    ):
         found("mug", (-2.0, 0.0, 0.0))
     model, result = found("mug", (0.3, 0.1, 0.1))
     evidence = result.residual, tdf.surface_logit(tdf.encode(model, other), other)

@@ -25,7 +25,9 @@ BOUNDS = {"angle": np.radians(10), "distance": 0.01}
 
 def made(*steps, base=random_poses(0, 1)[0]):
     """Poses a turn about x, degrees, and a distance along y, metres, away from a base, both in its frame."""
-    rotations = Rotation.from_quat(base[:4], scalar_first=True) * Rotation.from_rotvec([[np.radians(degrees), 0, 0] for degrees, _ in steps])
+    rotations = Rotation.from_quat(base[:4], scalar_first=True) * Rotation.from_rotvec(
+        [[np.radians(degrees), 0, 0] for degrees, _ in steps]
+    )
     places = carried(base, [[0, metres, 0] for _, metres in steps])
     return np.concatenate([rotations.as_quat(scalar_first=True), places], axis=1)
 
@@ -168,7 +170,9 @@ def test_an_energy_that_ignores_one_axis_leaves_a_move_free():
     assert abs(screw.pitch) > 100 * found.lever
     # What is not known has a variance all the same, a radian at the lever; the others are as before.
     np.testing.assert_allclose(found.covariance[3, 3], found.lever**2, rtol=0.01)
-    np.testing.assert_allclose(np.diagonal(found.covariance)[[0, 1, 2, 4, 5]], 2 * 2e-6 / expected[[0, 1, 2, 4, 5]], rtol=0.02)
+    np.testing.assert_allclose(
+        np.diagonal(found.covariance)[[0, 1, 2, 4, 5]], 2 * 2e-6 / expected[[0, 1, 2, 4, 5]], rtol=0.02
+    )
 
 
 @pytest.mark.parametrize(("weight", "count"), [(0.2, 1), (0.28, 0)])
@@ -224,7 +228,9 @@ def test_twists_are_turns_about_their_axis_at_any_angle():
     axis *= 2.5 / np.linalg.norm(axis)
     for share in (1e-6, 0.01, 1.0):
         turn = share * axis
-        R, moved = covariance_module._screwed(jnp.eye(3), jnp.asarray(turn, jnp.float32), jnp.asarray(np.cross(turn, centre - point), jnp.float32))
+        R, moved = covariance_module._screwed(
+            jnp.eye(3), jnp.asarray(turn, jnp.float32), jnp.asarray(np.cross(turn, centre - point), jnp.float32)
+        )
         expected = Rotation.from_rotvec(turn)
         np.testing.assert_allclose(R, expected.as_matrix(), atol=1e-6)
         np.testing.assert_allclose(moved, expected.apply(centre - point) + point - centre, atol=2e-6)
@@ -250,7 +256,9 @@ def test_one_sigma_along_the_axes_raises_the_energy_by_the_scale(shown, referenc
     def energy(twist):
         """By turning about the centre in the world, then moving: not as screws, which differs by little here."""
         turned = poses.exp(twist[:3]) @ R
-        return waypoint_loss(turned, found.centre + twist[3:] - turned @ middle, shown, reference.query, reference.descriptors[3])
+        return waypoint_loss(
+            turned, found.centre + twist[3:] - turned @ middle, shown, reference.query, reference.descriptors[3]
+        )
 
     steps = jnp.asarray(sigma[:, None] * np.asarray(found.directions), jnp.float32)
     rises = [(jax.vmap(energy)(sign * steps)) - energy(jnp.zeros(6)) for sign in (1, -1)]
@@ -259,7 +267,9 @@ def test_one_sigma_along_the_axes_raises_the_energy_by_the_scale(shown, referenc
     directions, values = (np.asarray(part, np.float64) for part in (found.directions, found.values))
     np.testing.assert_allclose(directions @ found.curvature @ directions.T, np.diag(values), atol=1e-4 * values[-1])
     measured = directions * np.repeat([found.lever**2, 1], 3)
-    np.testing.assert_allclose(measured @ found.covariance @ measured.T, np.diag(sigma**2), atol=1e-4 * sigma.max() ** 2)
+    np.testing.assert_allclose(
+        measured @ found.covariance @ measured.T, np.diag(sigma**2), atol=1e-4 * sigma.max() ** 2
+    )
     np.testing.assert_allclose(measured @ directions.T, np.eye(6), atol=1e-5)
 
 
@@ -339,7 +349,9 @@ def cup(seed, bottom, top, height=0.1, folds=8):
     radius = np.choose(part, [bottom + (top - bottom) * up, bottom + (top - bottom) * up - 0.004, bottom * np.sqrt(up)])
     z = np.where(part == 2, 0.0, up * height) - height / 2
     angle = rng.uniform(0, 2 * np.pi / folds, 32) + 2 * np.pi / folds * np.arange(folds)[:, None]
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.broadcast_to(z, angle.shape)], axis=-1).reshape(-1, 3)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.broadcast_to(z, angle.shape)], axis=-1).reshape(
+        -1, 3
+    )
 
 
 @pytest.fixture(scope="module")
@@ -355,11 +367,15 @@ def query():
 def transferred(model, query, points_a, points_b, place):
     """A place shown on one object and found on another, which lies elsewhere: the covariance there."""
     field = tdf.encode(model, points_a.astype(np.float32))
-    shown = tdf.Trajectory(poses.pose(jnp.asarray(place[:3, :3], jnp.float32), jnp.asarray(place[:3, 3], jnp.float32))[None])
+    shown = tdf.Trajectory(
+        poses.pose(jnp.asarray(place[:3, :3], jnp.float32), jnp.asarray(place[:3, 3], jnp.float32))[None]
+    )
     reference = tdf.Reference(tdf.trajectory_descriptor(field, shown, query), shown.shifted(-field.origin), query)
     moved = tdf.encode(model, carried(T_WORLD_OBJECT, points_b).astype(np.float32))
     config = tdf.SolveConfig(scouts=32, finalists=2)
-    result = tdf.solve(moved, reference, jax.random.key(1), fix_last=False, energy=tdf.EnergyWeights(0.0), config=config)
+    result = tdf.solve(
+        moved, reference, jax.random.key(1), fix_last=False, energy=tdf.EnergyWeights(0.0), config=config
+    )
     return pose_covariance(moved, reference, result.trajectory.wxyz_xyz[0])
 
 
@@ -370,7 +386,9 @@ def at(*place):
 @pytest.mark.parametrize("place", [at(-0.04, 0, 0.05), at(0.06, 0, 0), at(0, 0, 0.05)], ids=["rim", "side", "axis"])
 def test_a_cup_without_handle_is_free_to_turn_about_its_axis(mug_model, query, place, quick_compilation):
     found = transferred(mug_model, query, cup(0, 0.040, 0.045), cup(1, 0.038, 0.043), place)
-    assert found.values[0] < 0.005 * found.values[-1] and found.values[1] > 2 * covariance_module.FREE * found.values[-1]
+    assert (
+        found.values[0] < 0.005 * found.values[-1] and found.values[1] > 2 * covariance_module.FREE * found.values[-1]
+    )
     (screw,) = found.screws
     turn = Rotation.from_quat(T_WORLD_OBJECT[:4], scalar_first=True)
     direction, point = turn.inv().apply(screw.direction), turn.inv().apply(screw.point - T_WORLD_OBJECT[4:])

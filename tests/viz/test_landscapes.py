@@ -55,7 +55,9 @@ def test_an_isosurface_lies_where_the_energy_has_its_value(axes):
     """Of a bowl about one point: a sphere, whatever the order and number of the grid's axes."""
     coordinates = (np.linspace(-0.2, 0.2, 21), np.linspace(-0.15, 0.15, 31), np.linspace(-0.1, 0.15, 26))
     landscape = bowl(Grid(np.array([0.0, 0.01, 0.0]), np.eye(3) if axes is None else axes, coordinates))
-    landscape = dataclasses.replace(landscape, values=landscape.values[:1], waypoints=WAYPOINTS[:1], turned=landscape.turned[:1])
+    landscape = dataclasses.replace(
+        landscape, values=landscape.values[:1], waypoints=WAYPOINTS[:1], turned=landscape.turned[:1]
+    )
     triangles = terrain.isosurface(landscape, 0.02)
     radii = np.linalg.norm(triangles.reshape(-1, 3), axis=1)
     level = np.quantile(landscape.combined, 0.02)
@@ -71,7 +73,9 @@ def test_a_volume_is_drawn_with_its_object(marks):
         (axes,) = figure.axes
         pieces = [item for item in axes.collections if hasattr(item, "set_3d_properties")]
         assert pieces
-        assert {"least 2 % of the volume", "lowest-cost path"} <= {text.get_text() for text in figure.legends[0].get_texts()}
+        assert {"least 2 % of the volume", "lowest-cost path"} <= {
+            text.get_text() for text in figure.legends[0].get_texts()
+        }
 
 
 def test_slices_go_through_the_volume(tmp_path, marks):
@@ -107,7 +111,9 @@ def test_a_page_needs_no_network(tmp_path, marks, axes, masked):
 def test_a_map_of_many_waypoints_shows_some():
     landscape = bowl(plane_grid(0.2, 4))
     many = {"values": np.repeat(landscape.values, 50, axis=0), "turned": np.repeat(landscape.turned, 50, axis=0)}
-    figure = terrain.map_figure(dataclasses.replace(landscape, **many, waypoints=np.repeat(WAYPOINTS, 50, axis=0)), terrain.Marks(POINTS))
+    figure = terrain.map_figure(
+        dataclasses.replace(landscape, **many, waypoints=np.repeat(WAYPOINTS, 50, axis=0)), terrain.Marks(POINTS)
+    )
     titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
     assert len(titles) == 1 + terrain.PANELS
     assert titles[1] == "waypoint 0" and titles[-1] == "waypoint 99"

@@ -74,9 +74,16 @@ def check_layout(figure):
     spans = [[np.ptp(getattr(one, f"get_{name}lim")()) for name in "xyz"] for one in axes]
     np.testing.assert_allclose(spans, spans[0][0], rtol=1e-6)
     boxes = [one.get_position().transformed(figure.transFigure) for one in axes]
-    boxes += [text.get_window_extent() for text in figure.texts] + [legend.get_window_extent() for legend in figure.legends]
+    boxes += [text.get_window_extent() for text in figure.texts] + [
+        legend.get_window_extent() for legend in figure.legends
+    ]
     for index, box in enumerate(boxes):
-        assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1 and figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1
+        assert (
+            figure.bbox.x0 <= box.x0
+            and box.x1 <= figure.bbox.x1
+            and figure.bbox.y0 <= box.y0
+            and box.y1 <= figure.bbox.y1
+        )
         for other in boxes[:index]:
             overlap = min(box.x1, other.x1) - max(box.x0, other.x0), min(box.y1, other.y1) - max(box.y0, other.y0)
             assert min(overlap) < 1
@@ -123,6 +130,8 @@ def test_the_scale_bar_is_as_long_as_it_says(panels, coarse):
     axes = panels_of(figure)[0]
     around = np.radians(axes.azim)
     across = 5 * np.array([-np.sin(around), np.cos(around), 0])
-    ends = [axes.transData.transform(proj3d.proj_transform(*point, axes.get_proj())[:2]) for point in (0 * across, across)]
+    ends = [
+        axes.transData.transform(proj3d.proj_transform(*point, axes.get_proj())[:2]) for point in (0 * across, across)
+    ]
     (bar,) = [artist for artist in figure.artists + figure.lines if hasattr(artist, "get_xdata")]
     assert np.ptp(bar.get_xdata()) * figure.bbox.width == pytest.approx(np.linalg.norm(ends[1] - ends[0]), rel=1e-3)
