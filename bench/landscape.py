@@ -19,7 +19,7 @@ import numpy as np
 
 import tdf_jax as tdf
 from tdf_jax.evaluation.cases import mug_of
-from tdf_jax.landscape import shared_lattice as lattice
+from tdf_jax.landscape import shared_lattice
 
 HALF, COUNT, PITCH, LATTICE, POSES = 0.6, 101, 0.012, (6, 6, 7), 7
 VOLUME_HALF, VOLUME_COUNT = 0.3, 64
@@ -60,7 +60,7 @@ def plane(repetitions: int) -> dict:
     field, reference, start = case(PITCH)
     grid = tdf.plane_grid(HALF, COUNT, start)
     counts = {
-        share: lattice.evaluations(grid, lattice.layers(grid, np.asarray(reference.query), share))
+        share: shared_lattice.evaluations(grid, shared_lattice.layers(grid, np.asarray(reference.query), share))
         for share in (True, False)
     }
     times, values = {True: [], False: []}, {}
@@ -97,10 +97,10 @@ def volume() -> dict:
     grid = tdf.volume_grid(VOLUME_HALF, VOLUME_COUNT, start)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     seconds, _ = timed(field, reference, grid, True)
-    found = lattice.layers(grid, np.asarray(reference.query))
+    found = shared_lattice.layers(grid, np.asarray(reference.query))
     return {
         "points": list(grid.shape),
-        "evaluations": lattice.evaluations(grid, found),
+        "evaluations": shared_lattice.evaluations(grid, found),
         "one_by_one": int(np.prod(grid.shape)) * len(reference.query),
         "seconds_with_compilation": seconds,
         "peak_megabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,

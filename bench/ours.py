@@ -12,7 +12,7 @@ from flax.traverse_util import unflatten_dict
 
 import tdf_jax as tdf
 from bench import scene
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.networks.occupancy import condition, decode, encode_latent
 
 
@@ -36,12 +36,12 @@ def gradient(model, settings, arrays):
     """Energies, and gradients with respect to turns and places of the query points' mean."""
     field, reference, energy = _problem(model, arrays)
     centre = jnp.mean(reference.query, axis=0)
-    R0 = poses.rotation(jnp.asarray(arrays["starts"]))
-    places = poses.transform(jnp.asarray(arrays["starts"]), centre[None])[..., 0, :]
+    R0 = se3.rotation(jnp.asarray(arrays["starts"]))
+    places = se3.transform(jnp.asarray(arrays["starts"]), centre[None])[..., 0, :]
 
     def value(turn, place, R):
-        R = poses.exp(turn) @ R
-        return tdf.trajectory_energy(tdf.Trajectory(poses.pose(R, place - R @ centre)), field, reference, energy)
+        R = se3.exp(turn) @ R
+        return tdf.trajectory_energy(tdf.Trajectory(se3.pose(R, place - R @ centre)), field, reference, energy)
 
     program = jax.jit(jax.vmap(jax.value_and_grad(value, argnums=(0, 1))))
 

@@ -9,7 +9,7 @@ import tdf_jax as tdf
 from bench import flops, machine, scene
 from bench.measure import OURS, PEERS, Plan, Row, check, difference
 from tdf_jax._internal.errors import InputError
-from tdf_jax.landscape import shared_lattice as lattice
+from tdf_jax.landscape import shared_lattice
 
 NDF_RATES = {"rotation_rate": 0.01, "translation_rate": 0.01, "final_rate": 1.0}  # NDF's Adam, 1e-2 throughout
 # of one query point's graph; measured 87 and 104 kB, tuned heaps have holes
@@ -198,7 +198,10 @@ def sweeping(sizes: Sizes) -> Row:
     plans = {name: Plan("landscape", settings) for name in (*PEERS, "tdf_jax")}
     made = arrays()
     grid, query = scene.plane(sizes.grid, sizes.pitch, made["new"]), np.asarray(made["query"], float)
-    shared = sum(lattice.evaluations(grid, lattice.layers(grid, query @ R.T)) for R in made["rotations"].astype(float))
+    shared = sum(
+        shared_lattice.evaluations(grid, shared_lattice.layers(grid, query @ R.T))
+        for R in made["rotations"].astype(float)
+    )
     direct = sizes.grid**2 * len(query) * sizes.rotations
     work = dict.fromkeys(PEERS, flops.decoder(direct)) | {"tdf_jax": flops.decoder(shared)}
 

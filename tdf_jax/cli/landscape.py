@@ -20,11 +20,11 @@ from tdf_jax._internal.files import replace_file, replace_folder
 from tdf_jax.cli.options import LandscapeSettings, make_scene, resolved
 from tdf_jax.energy.reference import Reference, describe
 from tdf_jax.evaluation.scene import Scene
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.grid import PLANES, Grid, distance_from_polyline, path_grid, plane_grid, volume_grid
 from tdf_jax.geometry.query import lattice_query, snapped_query
 from tdf_jax.geometry.winding import libigl
-from tdf_jax.landscape import shared_lattice as lattice
+from tdf_jax.landscape import shared_lattice
 from tdf_jax.landscape.energy_grid import blank, fill, query_change
 from tdf_jax.landscape.shortest_path import lowest_cost_path
 from tdf_jax.landscape.storage import Landscape, load_landscape, save_landscape
@@ -90,9 +90,9 @@ def landscape(settings: Annotated[LandscapeSettings, tyro.conf.arg(name="")] = L
 def _rotations(settings, at_pick):
     """R_world_query of the sweep, (rotations, 3, 3)."""
     if settings.rotation == "best":
-        return poses.rotation_grid(settings.rotations)
+        return se3.rotation_grid(settings.rotations)
     if settings.rotation == "turns":
-        return poses.turns(settings.axis, settings.rotations, at_pick)
+        return se3.turns(settings.axis, settings.rotations, at_pick)
     return np.eye(3)[None] if settings.rotation == "identity" else at_pick[None]
 
 
@@ -191,7 +191,7 @@ def _digest(field, reference, grid, rotations) -> str:
     leaves += [] if grid.mask is None else [grid.mask]
     # Parts are counted by tiles, so these too.
     query = np.asarray(reference.query, dtype=float)
-    tiles = [lattice.tiles(grid, lattice.layers(grid, query @ R.T).span) for R in rotations]
+    tiles = [shared_lattice.tiles(grid, shared_lattice.layers(grid, query @ R.T).span) for R in rotations]
     content = b"".join(np.ascontiguousarray(leaf).tobytes() for leaf in leaves) + repr(tiles).encode()
     return hashlib.sha256(content).hexdigest()[:16]
 
@@ -203,15 +203,15 @@ def _ends(grid, start, goal):
 
 
 def _draw(settings, folder: Path, scene: Scene, found: Landscape, expected, path) -> None:
-    from tdf_jax.viz import landscapes as terrain
+    from tdf_jax.viz import landscapes
     from tdf_jax.viz.style import save_figure
 
-    marks = terrain.Marks(np.asarray(scene.points), scene.meshes[1], expected, path)
+    marks = landscapes.Marks(np.asarray(scene.points), scene.meshes[1], expected, path)
     if len(found.grid.shape) == 2:
-        save_figure(folder / "map.png", terrain.map_figure(found, marks))
+        save_figure(folder / "map.png", landscapes.map_figure(found, marks))
     else:
-        save_figure(folder / "isosurface.png", terrain.isosurface_figure(found, marks))
-        terrain.save_slices(folder / "slices.gif", found, marks)
+        save_figure(folder / "isosurface.png", landscapes.isosurface_figure(found, marks))
+        landscapes.save_slices(folder / "slices.gif", found, marks)
     if not settings.no_page:
         html.save_page(folder / "landscape.html", found, marks, "Energy landscape")
 
@@ -219,7 +219,7 @@ def _draw(settings, folder: Path, scene: Scene, found: Landscape, expected, path
 def _record(settings, found: Landscape, reference, change, waypoints, expected, path, seconds) -> dict:
     """Everything about a sweep that result.json holds."""
     query = np.asarray(reference.query, dtype=float)
-    layers = [lattice.layers(found.grid, query @ R.T) for R in found.rotations]
+    layers = [shared_lattice.layers(found.grid, query @ R.T) for R in found.rotations]
     truth = waypoints if expected is None else expected
     points = math.prod(found.grid.shape) if found.grid.mask is None else int(found.grid.mask.sum())
     return {
@@ -231,7 +231,7 @@ def _record(settings, found: Landscape, reference, change, waypoints, expected, 
         "grid": {"shape": found.grid.shape, "steps": found.grid.steps.tolist(), "first": found.grid.first.tolist()},
         "queries": len(query),
         "rotations": len(found.rotations),
-        "evaluations": sum(lattice.evaluations(found.grid, each) for each in layers),
+        "evaluations": sum(shared_lattice.evaluations(found.grid, each) for each in layers),
         "one_by_one": points * len(query) * len(found.rotations),
         "query_change": None if change is None else {"median": change[0], "largest": change[1]},
         "energy": {"least": float(np.nanmin(found.combined)), "median": float(np.nanmedian(found.combined))},

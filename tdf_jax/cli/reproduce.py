@@ -11,7 +11,7 @@ from tqdm import tqdm
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
 from tdf_jax.networks.checkpoint import load_model
-from tdf_jax.paper import figure2 as landscapes, figures, table
+from tdf_jax.paper import figures, table
 from tdf_jax.paper.runs import Run
 from tdf_jax.paper.setting import Setting, scene
 from tdf_jax.paper.store import Store
@@ -89,7 +89,7 @@ def _fig2(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
 
     count = FAST_GRID if fast else GRID
     fields = {
-        name: store.landscapes(base, name, count) for name in tqdm(landscapes.FIELDS, desc="figure 2", unit="field")
+        name: store.landscapes(base, name, count) for name in tqdm(energy_maps.FIELDS, desc="figure 2", unit="field")
     }
     yield _picture(out / "fig2.png", pictures.figure2({"test mug": fields["test mug"]}))
     yield _picture(out / "fig2_mugs_and_poses.png", pictures.figure2(fields))

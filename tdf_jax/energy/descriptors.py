@@ -4,7 +4,7 @@ import jax
 from jaxtyping import Array, Float
 
 from tdf_jax._internal.checks import check_query
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.networks.field import DescriptorField
 
@@ -23,7 +23,7 @@ def pose_descriptor(
         InputError: query points that are not (queries, 3) and finite.
     """
     check_query("pose_descriptor()", query)
-    return field.descriptors(poses.transform(T_world_query, query))
+    return field.descriptors(se3.transform(T_world_query, query))
 
 
 def trajectory_descriptor(

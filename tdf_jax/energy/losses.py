@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.reference import Reference
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.networks.field import DescriptorField
 
@@ -84,7 +84,7 @@ def descriptor_loss(trajectory: Trajectory, field: DescriptorField, reference: R
 
     def one(pose):
         T_world_query, descriptors = pose
-        R, t = poses.rotation(T_world_query), poses.translation(T_world_query)
+        R, t = se3.rotation(T_world_query), se3.translation(T_world_query)
         return waypoint_loss(R, t, field, reference.query, descriptors)
 
     return jnp.mean(jax.lax.map(one, (trajectory.wxyz_xyz, reference.descriptors)))
@@ -105,7 +105,7 @@ def waypoint_loss(
         query: points in the query frame, metres.
         descriptors: the demonstration's, of the same waypoint.
     """
-    return jnp.mean(jnp.abs(field.descriptors(poses.rotate(R, query) + t) - descriptors))
+    return jnp.mean(jnp.abs(field.descriptors(se3.rotate(R, query) + t) - descriptors))
 
 
 def pose_energy(
@@ -179,11 +179,11 @@ def pose_difference(
         target: the demonstration's, relative to its centroid, `wxyz_xyz`.
         lever, pose_norm: see `EnergyWeights`.
     """
-    shift = t - origin - poses.translation(target)
+    shift = t - origin - se3.translation(target)
     if pose_norm == "metres_radians":
-        turn = poses.rotation_distance(R, poses.rotation(target))[..., None]
+        turn = se3.rotation_distance(R, se3.rotation(target))[..., None]
     else:
-        turn = (R - poses.rotation(target)).reshape(*R.shape[:-2], 9)
+        turn = (R - se3.rotation(target)).reshape(*R.shape[:-2], 9)
     return jnp.concatenate([shift, lever * turn], axis=-1)
 
 

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.cases import Case
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -137,11 +137,11 @@ def aligned(
         if method == "PCA":
             T_b_a = principal_axes(case.points_a, case.points_b)
         else:
-            rotations = np.asarray(poses.uniform_rotations(jax.random.fold_in(start_key, index), inits), float)
+            rotations = np.asarray(se3.uniform_rotations(jax.random.fold_in(start_key, index), inits), float)
             T_b_a = iterative_closest_points(case.points_a, case.points_b, rotations)
         found.append(T_b_a @ case.T_world_place_a)
     found = np.stack(found).astype(np.float32)
-    return np.asarray(poses.pose(found[:, :3, :3], found[:, :3, 3]))
+    return np.asarray(se3.pose(found[:, :3, :3], found[:, :3, 3]))
 
 
 def _icp(T_a_b, points_a, points_b, tree_a):

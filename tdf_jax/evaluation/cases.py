@@ -10,7 +10,7 @@ from jaxtyping import Float
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.annotated_meshes import AnnotatedMesh
 from tdf_jax.evaluation.conditions import CONDITIONS, SCALES, observed
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.shapes import FAMILIES, Mug, Shape, scaled
 
@@ -97,7 +97,7 @@ def random_pose(seed: int, index: int, reach: float = 0.3) -> Float[np.ndarray, 
         jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), POSE_STREAM), index)
     )
     T = np.eye(4)
-    T[:3, :3] = poses.uniform_rotations(rotation_key, 1)[0]
+    T[:3, :3] = se3.uniform_rotations(rotation_key, 1)[0]
     T[:3, 3] = jax.random.uniform(place_key, (3,), minval=-reach, maxval=reach)
     return T
 

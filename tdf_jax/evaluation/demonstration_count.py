@@ -17,7 +17,7 @@ from tdf_jax.evaluation.cases import mug_of
 from tdf_jax.evaluation.methods import EVERY, STREAM
 from tdf_jax.evaluation.metrics import pose_error
 from tdf_jax.evaluation.path_tasks import Task
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.geometry.trajectory import Trajectory
@@ -89,7 +89,7 @@ def _demonstrations(task, seed, count) -> list[Demonstration]:
     parameters = task.case.object_a.parameters
     for number in range(count):
         mug = mug_of(seed, MUGS + MOST * task.index + number, parameters.height)
-        pose = poses.pose(
+        pose = se3.pose(
             *(jnp.asarray(part, jnp.float32) for part in (mug.handle_frame[:3, :3], mug.handle_frame[:3, 3]))
         )
         points = sample_surface(mug.mesh, POINTS, number).astype(np.float32)

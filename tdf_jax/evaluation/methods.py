@@ -20,7 +20,7 @@ from tdf_jax.energy.reference import Reference, describe
 from tdf_jax.evaluation.baselines import principal_axes, rigid_motion, settled_points
 from tdf_jax.evaluation.comparison import random_weights
 from tdf_jax.evaluation.path_tasks import Task, carried_by
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.geometry.transport import carry_to_picks
 from tdf_jax.networks.encoding import encode
@@ -140,7 +140,7 @@ def _principal_axes(task, *_) -> Attempt:
 
 
 def _closest_points(task, model, encoded, key, inits) -> Attempt:
-    rotations = np.asarray(poses.uniform_rotations(key, inits), float)
+    rotations = np.asarray(se3.uniform_rotations(key, inits), float)
     began = time.perf_counter()
     motions, costs = settled_points(task.case.points_a, task.case.points_b, rotations)
     return _carried(task, carried_by(task, motions), costs, time.perf_counter() - began)

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tdf_jax.evaluation.annotated_meshes import AnnotatedMesh
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.symmetry import equivalent
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.geometry.transport import carry_trajectory
@@ -37,7 +37,7 @@ def expected_trajectory(
         T_world_query on object b.
     """
     pick_motion = jnp.asarray(T_world_place_b @ np.linalg.inv(T_world_place_a), demonstrated.wxyz_xyz.dtype)
-    pick = poses.compose(poses.pose(pick_motion[:3, :3], pick_motion[:3, 3]), demonstrated.wxyz_xyz[0])
+    pick = se3.compose(se3.pose(pick_motion[:3, :3], pick_motion[:3, 3]), demonstrated.wxyz_xyz[0])
     return carry_trajectory(demonstrated, pick, goal)
 
 
@@ -72,8 +72,8 @@ def pose_error(found: Float[Array, "... 7"], truth: Float[Array, "... 7"]) -> tu
         found, truth: poses `wxyz_xyz`; batch axes broadcast.
     """
     found, truth = jnp.asarray(found), jnp.asarray(truth)
-    distance = jnp.linalg.norm(poses.translation(found) - poses.translation(truth), axis=-1)
-    return np.asarray(distance), np.asarray(poses.rotation_distance(poses.rotation(found), poses.rotation(truth)))
+    distance = jnp.linalg.norm(se3.translation(found) - se3.translation(truth), axis=-1)
+    return np.asarray(distance), np.asarray(se3.rotation_distance(se3.rotation(found), se3.rotation(truth)))
 
 
 def path_error(found: Trajectory, truth: Trajectory) -> float:

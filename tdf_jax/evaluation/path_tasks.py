@@ -12,7 +12,7 @@ from tdf_jax.evaluation.cases import SEED_SPACE, Case
 from tdf_jax.evaluation.metrics import expected_trajectory
 from tdf_jax.evaluation.pick_transfer import QUERIES, QUERY_SIZE
 from tdf_jax.evaluation.scene import place_demonstration
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.paths import PATHS
 from tdf_jax.geometry.query import box_query
@@ -97,4 +97,4 @@ def mesh_index(name: str, pose: int) -> int:
 def carried_by(task: Task, T_b_a: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 7"]:
     """The demonstrated pick as motions of object a onto object b carry it, `wxyz_xyz`."""
     T = np.asarray(T_b_a, float) @ np.asarray(task.demonstration.trajectory.matrices[0], float)
-    return np.asarray(poses.pose(T[..., :3, :3].astype(np.float32), T[..., :3, 3].astype(np.float32)))
+    return np.asarray(se3.pose(T[..., :3, :3].astype(np.float32), T[..., :3, 3].astype(np.float32)))

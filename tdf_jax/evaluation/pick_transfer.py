@@ -13,7 +13,7 @@ from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference
 from tdf_jax.evaluation.cases import Case, Transfer
 from tdf_jax.evaluation.metrics import nearest_place, pose_error
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.query import box_query
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.networks.encoding import encode
@@ -68,7 +68,7 @@ def place_errors(
             for T, case in zip(T_world_found, cases, strict=True)
         ]
     ).astype(np.float32)
-    distance, angle = pose_error(found, poses.pose(truth[:, :3, :3], truth[:, :3, 3]))
+    distance, angle = pose_error(found, se3.pose(truth[:, :3, :3], truth[:, :3, 3]))
     return distance, np.degrees(angle)
 
 
@@ -83,7 +83,7 @@ def place_reference(model: Model, case: Transfer, query: Float[Array, "queries 3
     """The demonstration of one pose: the query frame at the place on object a."""
     field = encode(model, case.points_a)
     place = jnp.asarray(case.T_world_place_a, jnp.float32)
-    T_world_query = poses.pose(place[:3, :3], place[:3, 3])
+    T_world_query = se3.pose(place[:3, :3], place[:3, 3])
     shown = Trajectory(T_world_query[None]).shifted(-field.origin)
     return Reference(_describe(field, T_world_query, query)[None], shown, query)
 

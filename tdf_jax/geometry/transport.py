@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tdf_jax._internal.errors import InputError
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.trajectory import Trajectory
 
 
@@ -32,15 +32,15 @@ def carry_trajectory(demonstrated: Trajectory, pick: Float[Array, "7"], goal: Fl
         if pose is not None and np.shape(pose) != (7,):
             raise InputError(f"carry_trajectory(): {name} has shape {np.shape(pose)}; expected one pose wxyz_xyz, (7,)")
     pick, goal = jnp.asarray(pick), None if goal is None else jnp.asarray(goal)
-    pick_motion = poses.compose(pick, poses.inverse(demonstrated.wxyz_xyz[0]))
+    pick_motion = se3.compose(pick, se3.inverse(demonstrated.wxyz_xyz[0]))
     if goal is None:
         return demonstrated.transformed(pick_motion)
-    goal_motion = poses.compose(goal, poses.inverse(demonstrated.wxyz_xyz[-1]))
+    goal_motion = se3.compose(goal, se3.inverse(demonstrated.wxyz_xyz[-1]))
     s = jnp.arange(demonstrated.poses) / max(1, demonstrated.poses - 1)
-    turn = poses.geodesic(poses.rotation(pick_motion), poses.rotation(goal_motion), s)
+    turn = se3.geodesic(se3.rotation(pick_motion), se3.rotation(goal_motion), s)
     t = demonstrated.translations
-    carried = (1 - s)[:, None] * poses.transform(pick_motion, t) + s[:, None] * poses.transform(goal_motion, t)
-    return Trajectory(poses.pose(poses.multiply(turn, demonstrated.rotations), carried))
+    carried = (1 - s)[:, None] * se3.transform(pick_motion, t) + s[:, None] * se3.transform(goal_motion, t)
+    return Trajectory(se3.pose(se3.multiply(turn, demonstrated.rotations), carried))
 
 
 @jax.jit

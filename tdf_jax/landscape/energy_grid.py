@@ -10,9 +10,9 @@ from jaxtyping import Array, Float
 from tdf_jax._internal.devices import check_mesh
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.reference import Reference
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.grid import Grid
-from tdf_jax.landscape import shared_lattice as lattice
+from tdf_jax.landscape import shared_lattice
 from tdf_jax.landscape.storage import TEMPERATURE, Landscape
 from tdf_jax.networks.field import DescriptorField
 
@@ -44,8 +44,8 @@ def energy_landscape(
         field: the object's.
         reference: the demonstration's; waypoints may be of several.
         grid: positions of the query frame's origin.
-        rotation: orientation R_world_query, or several (rotations, 3, 3), such as `poses.rotation_grid` or
-            `poses.turns` give; by default the world's axes, as in the paper.
+        rotation: orientation R_world_query, or several (rotations, 3, 3), such as `se3.rotation_grid` or
+            `se3.turns` give; by default the world's axes, as in the paper.
         reduce: how waypoints are combined, see `Landscape.combined`.
         over_rotations: of several rotations, keep the "best" at every point and for every waypoint, or "each".
         temperature: of the soft least, in units of the energy.
@@ -127,14 +127,14 @@ def fill(
     """
     check_mesh("energy_landscape()", mesh)
     grid, query = landscape.grid, np.asarray(reference.query, dtype=float)
-    found = [lattice.layers(grid, query @ R.T, share) for R in landscape.rotations]
-    cover = [lattice.tiles(grid, each.span) for each in found]
+    found = [shared_lattice.layers(grid, query @ R.T, share) for R in landscape.rotations]
+    cover = [shared_lattice.tiles(grid, each.span) for each in found]
     total = sum(map(len, cover))
     before = 0
     for index, (layers, tiles) in enumerate(zip(found, cover)):
         left = tiles[max(done - before, 0) :]
         before += len(tiles)
-        for tile, values in lattice.swept(field, reference.descriptors, grid, layers, left, mesh):
+        for tile, values in shared_lattice.swept(field, reference.descriptors, grid, layers, left, mesh):
             _keep(landscape, index, tile.within(grid.shape), values)
             done += 1
             yield done, total
@@ -179,7 +179,7 @@ def query_change(
     points = jnp.asarray(grid.first + chosen @ (grid.steps[:, None] * grid.directions), field.origin.dtype)
     R = jnp.eye(3) if rotation is None else jnp.asarray(rotation)
     before, after = (
-        np.asarray(_at(field, one.descriptors, poses.rotate(R, one.query), points)) for one in (reference, changed)
+        np.asarray(_at(field, one.descriptors, se3.rotate(R, one.query), points)) for one in (reference, changed)
     )
     apart = np.abs(after - before) / before
     return float(np.median(apart)), float(apart.max())

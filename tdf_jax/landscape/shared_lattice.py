@@ -151,7 +151,7 @@ def swept(
     found: Layers,
     which: Sequence[Tile],
     mesh: jax.sharding.Mesh | None = None,
-) -> Iterator[tuple[Tile, Float[np.ndarray, "poses *tile"]]]:
+) -> Iterator[tuple[Tile, Float[np.ndarray, " poses *tile"]]]:
     """Energies of every waypoint on tiles, in their order.
 
     As many tiles are computed at a time as the mesh has devices, one on each; no more is held. Of several processes

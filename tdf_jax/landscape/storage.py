@@ -34,10 +34,10 @@ class Landscape:
     """
 
     grid: Grid
-    values: Float[np.ndarray, "poses *shape"]
+    values: Float[np.ndarray, " poses *shape"]
     waypoints: Float[np.ndarray, "poses 3"]
     rotations: Float[np.ndarray, "rotations 3 3"]
-    turned: Int[np.ndarray, "poses *shape"] | None = None
+    turned: Int[np.ndarray, " poses *shape"] | None = None
     reduce: str = "least"
     temperature: float = TEMPERATURE
 

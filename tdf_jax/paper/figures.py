@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.paper.runs import Run
 from tdf_jax.paper.setting import SHAPES, Setting
 
@@ -55,7 +55,7 @@ def collected(run: Runner, settings: dict) -> dict:
 
 def turned(path: Float[np.ndarray, "poses 7"], reference: Float[np.ndarray, "poses 7"]) -> Float[np.ndarray, " poses"]:
     """Angle of each pose from the demonstration's, degrees: how the query frame turns along the path."""
-    return np.degrees(np.asarray(poses.rotation_distance(poses.rotation(path), poses.rotation(reference))))
+    return np.degrees(np.asarray(se3.rotation_distance(se3.rotation(path), se3.rotation(reference))))
 
 
 def mean_over_seeds(runs: dict[tuple, Run], value: Callable[[Run], float]) -> dict[float, dict[float, float]]:

@@ -19,7 +19,7 @@ from tdf_jax._internal import devices
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import EnergyWeights, pose_energy, waypoint_loss
 from tdf_jax.energy.reference import Reference
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.networks.field import DescriptorField
 from tdf_jax.solvers.initial import STARTS, prepare
 from tdf_jax.solvers.result import Result
@@ -136,7 +136,7 @@ def optimize(
 @jax.jit
 def _begin(starts, query):
     """The optimiser's state: the variables (rotation vectors away from the starts, places of the query centroid), Adam's moments, steps done."""
-    places = poses.transform(starts, jnp.mean(query, axis=0)[None])[..., 0, :]
+    places = se3.transform(starts, jnp.mean(query, axis=0)[None])[..., 0, :]
     variables = (jnp.zeros_like(places), places)
     return variables, optax.scale_by_adam().init(variables), jnp.zeros((), jnp.int32)
 
@@ -144,8 +144,8 @@ def _begin(starts, query):
 def _poses(variables, start_rotations, query):
     """Rotations and translations (of the query frame's origin) of the variables."""
     turn, place = variables
-    R = poses.multiply(poses.exp(turn), start_rotations)
-    return R, place - poses.rotate(R, jnp.mean(query, axis=0)[None])[..., 0, :]
+    R = se3.multiply(se3.exp(turn), start_rotations)
+    return R, place - se3.rotate(R, jnp.mean(query, axis=0)[None])[..., 0, :]
 
 
 @functools.partial(jax.jit, static_argnames=("fix_last", "chunk", "mesh"), donate_argnums=0)
@@ -180,7 +180,7 @@ def _steps(state, starts, field, reference, energy, rates, steps, *, fix_last, c
 
 @functools.partial(jax.jit, static_argnames="fix_last")
 def _trajectories(state, starts, query, *, fix_last):
-    wxyz_xyz = poses.pose(*_poses(state[0], poses.rotation(starts), query))
+    wxyz_xyz = se3.pose(*_poses(state[0], se3.rotation(starts), query))
     return wxyz_xyz.at[:, -1].set(starts[:, -1]) if fix_last else wxyz_xyz
 
 
@@ -202,7 +202,7 @@ def _evaluator(starts, field, reference, energy, fix_last, chunk):
         variables, start_rotation, index = pose
         return jax.value_and_grad(waypoint)(variables, start_rotation, reference.descriptors[index])
 
-    start_rotations = poses.rotation(starts)
+    start_rotations = se3.rotation(starts)
     fixed = 0.0
     if fix_last:
         last = start_rotations[:, -1], starts[:, -1, 4:]  # given starts may end apart

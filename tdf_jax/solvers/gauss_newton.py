@@ -16,7 +16,7 @@ from tdf_jax._internal import devices
 from tdf_jax._internal.precision import full_precision
 from tdf_jax.energy.losses import pose_difference
 from tdf_jax.energy.reference import Reference
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 
 LARGEST_TURN, LARGEST_MOVE = 0.7, 0.05  # radians and metres of one step
 DAMPINGS = 1e-3, 1e3  # least and greatest
@@ -117,7 +117,7 @@ def _steps(R, place, waypoint, bounds, damping, tolerance, field, problem, energ
 
     def body(carry):
         i, state, damping, step, _, history = carry
-        R, place = poses.multiply(poses.exp(step[:, :3]), state.R), state.place + step[:, 3:]
+        R, place = se3.multiply(se3.exp(step[:, :3]), state.R), state.place + step[:, 3:]
         trial = _State(R, place, *_evaluate(R, place, waypoint, bounds, field, problem, energy, chunk))
         # The first time nothing has moved and the state's energies are infinite: it takes what is finite.
         better = trial.energy < state.energy
@@ -195,7 +195,7 @@ def _evaluate(R, place, waypoint, bounds, field, problem, energy, chunk):
 
 def _match(R, place, field, query, weights, shown):
     """Weighted sums over query points of the mean absolute difference of descriptors, its gradient and its model's curvature."""
-    arm = poses.rotate(R, query)
+    arm = se3.rotate(R, query)
     x = (arm + place[:, None]).reshape(-1, 3)
 
     def along(axis):

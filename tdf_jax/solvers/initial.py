@@ -12,7 +12,7 @@ from tdf_jax._internal.checks import check_key
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.trajectory import Trajectory, check_trajectory
 from tdf_jax.networks.field import DescriptorField
 
@@ -116,12 +116,12 @@ def _start(key, origin, reference, start, radius):
     n, dtype = reference.trajectory.poses, reference.trajectory.wxyz_xyz.dtype
     turn_key, way_key, far_key = jax.random.split(key, 3)
     if start == "carried":
-        turn = poses.uniform_rotations(turn_key, 1)[0].astype(dtype)
-        return reference.trajectory.transformed(poses.pose(turn, origin)).wxyz_xyz
+        turn = se3.uniform_rotations(turn_key, 1)[0].astype(dtype)
+        return reference.trajectory.transformed(se3.pose(turn, origin)).wxyz_xyz
     # Uniform in the ball; `jax.random.ball` takes 2 s to compile.
     way = jax.random.normal(way_key, (n, 3), dtype)
     far = radius * jnp.cbrt(jax.random.uniform(far_key, (n, 1), dtype))
     place = far * way / jnp.linalg.norm(way, axis=-1, keepdims=True)
-    R = poses.uniform_rotations(turn_key, n).astype(dtype)
+    R = se3.uniform_rotations(turn_key, n).astype(dtype)
     centre = jnp.mean(reference.query, axis=0)
-    return poses.pose(R, origin + place - poses.rotate(R, centre[None])[:, 0])
+    return se3.pose(R, origin + place - se3.rotate(R, centre[None])[:, 0])

@@ -30,9 +30,9 @@ from tdf_jax._internal.checks import check_key
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.networks.field import DescriptorField
-from tdf_jax.solvers import gauss_newton as descent
+from tdf_jax.solvers import gauss_newton
 from tdf_jax.solvers.initial import STARTS, prepare
 from tdf_jax.solvers.result import Result
 
@@ -221,16 +221,18 @@ def _problem(key, reference, size):
     shuffled = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel()).permutation(count)
     shape = -(-count // size), size
     # What fills up the last block is any point, and does not count.
-    return descent.in_blocks(reference, np.resize(shuffled, shape), (np.arange(np.prod(shape)) < count).reshape(shape))
+    return gauss_newton.in_blocks(
+        reference, np.resize(shuffled, shape), (np.arange(np.prod(shape)) < count).reshape(shape)
+    )
 
 
 def _candidates(wxyz_xyz, problem):
-    R = np.asarray(poses.rotation(wxyz_xyz))
-    return Candidates(R, R @ np.asarray(problem.centre) + np.asarray(poses.translation(wxyz_xyz)))
+    R = np.asarray(se3.rotation(wxyz_xyz))
+    return Candidates(R, R @ np.asarray(problem.centre) + np.asarray(se3.translation(wxyz_xyz)))
 
 
 def _poses(candidates, problem):
-    return np.asarray(poses.pose(candidates.R, candidates.place - candidates.R @ np.asarray(problem.centre)))
+    return np.asarray(se3.pose(candidates.R, candidates.place - candidates.R @ np.asarray(problem.centre)))
 
 
 def _like(order, part):
@@ -292,7 +294,7 @@ def _run(stage, candidates, fixed=None, waypoints=None, *, shared, config, room,
         given = devices.placed([part[dealt] for part in given], mesh, devices.split(mesh))
         limits = devices.placed(limits, mesh)
     chunk = config.chunk or devices.points_at_a_time(CHUNK_POINTS)
-    results = descent.descend(*given, *limits, *shared, length=max(config.steps) + 1, chunk=chunk, mesh=mesh)
+    results = gauss_newton.descend(*given, *limits, *shared, length=max(config.steps) + 1, chunk=chunk, mesh=mesh)
     R, place, values = (
         devices.gathered(part)[np.argsort(dealt)] if mesh is not None else np.asarray(part) for part in results
     )

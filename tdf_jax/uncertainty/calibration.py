@@ -88,7 +88,7 @@ def ranking(predicted: Float[np.ndarray, " picks"], right: Float[np.ndarray, " p
 
 def logistic(
     features: Float[np.ndarray, "cases features"], right: Float[np.ndarray, " cases"]
-) -> Float[np.ndarray, "1+features"]:
+) -> Float[np.ndarray, " 1+features"]:
     """Intercept and slopes of the logistic curve of maximal likelihood, by Newton's method.
 
     Args:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import waypoint_loss
 from tdf_jax.energy.reference import Reference
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.networks.field import DescriptorField
 
 # The rise of the energy that counts as one sigma. Of 18 handles found on generated mugs the squared normalised errors
@@ -176,10 +176,10 @@ def _check(function, reference, pose, waypoint, scale):
 
 @jax.jit
 def _covariance(field, query, descriptors, pose, scale):
-    R, middle = poses.rotation(pose), jnp.mean(query, axis=0)
+    R, middle = se3.rotation(pose), jnp.mean(query, axis=0)
     query = query - middle
     lever = jnp.sqrt(jnp.mean(jnp.sum(query**2, axis=-1)))
-    centre = poses.rotate(R, middle[None])[0] + poses.translation(pose)
+    centre = se3.rotate(R, middle[None])[0] + se3.translation(pose)
 
     def energy(step):
         # In the query's axes the steps turn with object and pose, and so does all that follows from them.
@@ -242,7 +242,7 @@ def _screwed(R, turn, move):
     axis = turn / safe
     sinc, versine = jnp.sinc(angle / jnp.pi), (1 - jnp.cos(angle)) / safe
     carried = sinc * move + (1 - sinc) * jnp.sum(axis * move) * axis + versine * jnp.cross(axis, move)
-    return _product(R, poses.exp(turn)), poses.rotate(R, carried[None])[0]
+    return _product(R, se3.exp(turn)), se3.rotate(R, carried[None])[0]
 
 
 def _product(a, b):

@@ -11,7 +11,7 @@ import numpy as np
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
 from tdf_jax.landscape.storage import Landscape
-from tdf_jax.viz import polygons3d as solid
+from tdf_jax.viz import polygons3d
 from tdf_jax.viz.landscapes import (
     ANGLES,
     LEVELS,
@@ -65,7 +65,15 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
         i, j, k = np.asarray(marks.mesh.faces).T
         drawn.append(
             plotly.Mesh3d(
-                x=x, y=y, z=z, i=i, j=j, k=k, color=matplotlib.colors.to_hex(solid.CLAY), name="object", showlegend=True
+                x=x,
+                y=y,
+                z=z,
+                i=i,
+                j=j,
+                k=k,
+                color=matplotlib.colors.to_hex(polygons3d.CLAY),
+                name="object",
+                showlegend=True,
             )
         )
     else:

@@ -15,7 +15,7 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
 from tdf_jax.geometry.winding import libigl
 from tdf_jax.landscape.storage import Landscape
-from tdf_jax.viz import polygons3d as solid
+from tdf_jax.viz import polygons3d
 from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, LIGHT, STYLE, TRUTH, blank_figure, legend_of
 
 if TYPE_CHECKING:
@@ -116,9 +116,9 @@ def isosurface_figure(landscape: Landscape, marks: Marks, title: str = "") -> Fi
     with matplotlib.rc_context(STYLE):
         figure = blank_figure(6.5, 5.6)
         axes = figure.add_axes((0.0, 0.12, 1.0, 0.84), projection="3d")
-        pieces = solid.Pieces([], [], [])
+        pieces = polygons3d.Pieces([], [], [])
         if marks.mesh is not None:
-            pieces += solid.surface(CENTIMETRES * np.asarray(marks.mesh.triangles), LIGHT)
+            pieces += polygons3d.surface(CENTIMETRES * np.asarray(marks.mesh.triangles), LIGHT)
         else:
             axes.scatter(
                 *(CENTIMETRES * marks.points[:: max(1, len(marks.points) // SHOWN)].T), s=1.5, color=CLOUD, linewidths=0
@@ -126,7 +126,9 @@ def isosurface_figure(landscape: Landscape, marks: Marks, title: str = "") -> Fi
         for share, colour in zip(LEVELS, SURFACES):
             triangles = CENTIMETRES * isosurface(landscape, share)
             count = len(triangles)
-            pieces += solid.Pieces(list(triangles), [(*colour[:3], SEE_THROUGH)] * count, [(*colour[:3], 0.0)] * count)
+            pieces += polygons3d.Pieces(
+                list(triangles), [(*colour[:3], SEE_THROUGH)] * count, [(*colour[:3], 0.0)] * count
+            )
             axes.plot(
                 [], [], [], color=colour, lw=6, alpha=2 * SEE_THROUGH, label=f"least {100 * share:.0f} % of the volume"
             )

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
-from tdf_jax.viz import polygons3d as solid
+from tdf_jax.viz import polygons3d
 from tdf_jax.viz.style import CENTIMETRES, INK, LIGHT, STYLE, TRUTH
 
 FOUND = "#2a6f97"
@@ -79,8 +79,8 @@ def transfer_figure(panels: Sequence[Panel], title: str = "") -> Figure:
         figure = _figure(len(panels), 1, title, edge)
         for index, panel in enumerate(panels):
             pieces = _surface(panel.triangles)
-            pieces += solid.box(CENTIMETRES * true[index], TRUTH, filled=False, dashed=True)
-            pieces += solid.box(CENTIMETRES * found[index], FOUND)
+            pieces += polygons3d.box(CENTIMETRES * true[index], TRUTH, filled=False, dashed=True)
+            pieces += polygons3d.box(CENTIMETRES * found[index], FOUND)
             _draw(_axes(figure, index, 1, 0, ""), pieces, contents[index], edge)
             _name(figure, index, 1, f"{panel.name}\n{panel.error}")
         lines = [Line2D([], [], color=TRUTH, ls=(0, (3, 2))), Line2D([], [], color=FOUND)]
@@ -125,20 +125,20 @@ def _axes(figure: Figure, index: int, rows: int, row: int, label: str) -> Axes3D
     return figure.add_axes((x / width, y / height, PANEL / width, PANEL / height), projection="3d")
 
 
-def _surface(triangles) -> solid.Pieces:
+def _surface(triangles) -> polygons3d.Pieces:
     """Shaded pieces, in centimetres, cut small enough to be painted in the right order."""
     from trimesh.remesh import subdivide_to_size
 
     if not len(triangles):
-        return solid.Pieces([], [], [])
+        return polygons3d.Pieces([], [], [])
     corners = triangles.reshape(-1, 3)
     longest = np.linalg.norm(np.ptp(corners, axis=0)) / PIECES
     vertices, faces = subdivide_to_size(corners, np.arange(len(corners)).reshape(-1, 3), longest, max_iter=20)
-    return solid.surface(CENTIMETRES * vertices[faces], LIGHT)
+    return polygons3d.surface(CENTIMETRES * vertices[faces], LIGHT)
 
 
 def _corners(T, size):
-    return size * (solid.CORNERS - 0.5) @ T[:3, :3].T + T[:3, 3]
+    return size * (polygons3d.CORNERS - 0.5) @ T[:3, :3].T + T[:3, 3]
 
 
 def _across() -> np.ndarray:
@@ -155,7 +155,7 @@ def _edge(contents) -> float:
     return 1.04 * max(float(np.ptp(content @ _across().T, axis=0).max()) for content in contents)
 
 
-def _draw(axes: Axes3D, pieces: solid.Pieces, content, edge: float) -> None:
+def _draw(axes: Axes3D, pieces: polygons3d.Pieces, content, edge: float) -> None:
     if pieces.polygons:
         axes.add_collection3d(pieces.collection(), autolim=False)
     seen = content @ _across().T

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from tdf_jax.geometry.trajectory import Trajectory
-from tdf_jax.viz import polygons3d as solid
+from tdf_jax.viz import polygons3d
 from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, LIGHT, STYLE, TRUTH, blank_figure, legend_of
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def triangles_of(mesh: "trimesh.Trimesh | None") -> Float[np.ndarray, "faces 3 3
 def bounds(query: Float[np.ndarray, "queries 3"]) -> Float[np.ndarray, "8 3"]:
     """Corners of the query points' bounding box, in the query frame."""
     low, high = query.min(axis=0), query.max(axis=0)
-    return low + solid.CORNERS * (high - low)
+    return low + polygons3d.CORNERS * (high - low)
 
 
 def _carried(trajectory, box):
@@ -72,17 +72,17 @@ def content(view: View, box: Float[np.ndarray, "8 3"]) -> Float[np.ndarray, "poi
 
 def draw(axes: Axes3D, view: View, box: Float[np.ndarray, "8 3"]) -> None:
     """Draw a view's object, boxes and paths."""
-    pieces = solid.Pieces([], [], [])
+    pieces = polygons3d.Pieces([], [], [])
     if view.triangles is None:
         cloud = view.points[:: -(-len(view.points) // SHOWN_POINTS)]
         axes.scatter(*(CENTIMETRES * cloud.T), s=2.4, color=CLOUD, linewidths=0, label="object's points")
     else:
-        pieces += solid.surface(CENTIMETRES * view.triangles, LIGHT)
+        pieces += polygons3d.surface(CENTIMETRES * view.triangles, LIGHT)
     corners = CENTIMETRES * _carried(view.trajectory, box)
     for fraction, one in zip(np.linspace(0, 1, len(corners)), corners):
-        pieces += solid.box(one, COLOURS(fraction))
+        pieces += polygons3d.box(one, COLOURS(fraction))
     if view.expected is not None:
-        pieces += solid.box(CENTIMETRES * _carried(view.expected, box)[0], TRUTH, filled=False, dashed=True)
+        pieces += polygons3d.box(CENTIMETRES * _carried(view.expected, box)[0], TRUTH, filled=False, dashed=True)
     axes.computed_zorder = False
     # `frame` sets the limits. Left to matplotlib, they are taken over polygons padded to one length with uninitialised
     # memory: once in a while an overflow.

@@ -12,8 +12,7 @@ from conftest import SMALL, random_cloud, random_poses
 
 import tdf_jax as tdf
 from tdf_jax._internal.precision import full_precision
-from tdf_jax.geometry import se3 as poses
-from tdf_jax.solvers import gauss_newton as descent
+from tdf_jax.geometry import se3
 from tdf_jax.training.objective import mean_gradient
 
 EXACT, FAST = jax.lax.Precision.HIGHEST, jax.lax.Precision.DEFAULT
@@ -74,11 +73,11 @@ def test_fields_and_their_derivatives_are_exact(small_model, problem):
 
 def test_rotations_are_multiplied_exactly_whatever_is_set():
     with jax.default_matmul_precision("tensorfloat32"):
-        assert precisions(poses.multiply, jnp.eye(3), jnp.eye(3)) == {EXACT}
+        assert precisions(se3.multiply, jnp.eye(3), jnp.eye(3)) == {EXACT}
 
 
 @pytest.mark.parametrize(("optimise", "config", "module", "program"), [
-    (tdf.solve, tdf.SolveConfig(inits=2), descent, "descend"),
+    (tdf.solve, tdf.SolveConfig(inits=2), gauss_newton, "descend"),
     (tdf.optimize, tdf.OptimizeConfig(inits=2, iterations=2), sys.modules["tdf_jax.solvers.adam"], "_run"),
 ])  # fmt: skip
 def test_both_optimisers_are_exact(problem, monkeypatch, optimise, config, module, program):

@@ -12,7 +12,7 @@ import tdf_jax as tdf
 from tdf_jax.cli import landscape as command
 from tdf_jax.cli.main import main
 from tdf_jax.io.demonstrations import save_demonstration
-from tdf_jax.landscape import shared_lattice as lattice
+from tdf_jax.landscape import shared_lattice
 
 QUICK = ("--points", 60, "--poses", 3, "--queries", 8, "--half", 0.1, "--pitch", 0.05)
 
@@ -93,7 +93,7 @@ def test_orientations(sweep, rotation, count):
 
 
 def test_an_interrupted_sweep_goes_on(sweep, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(lattice, "NODES", 60)
+    monkeypatch.setattr(shared_lattice, "NODES", 60)
     wanted, whole = sweep("--grid", "volume")
     shutil.rmtree(tmp_path / "out")
     true_fill, calls = command.fill, []
@@ -197,7 +197,7 @@ def test_missing_extras_are_told_before_any_work(weights, tmp_path, monkeypatch,
 
 def test_a_long_sweep_is_kept_on_the_way(sweep, tmp_path, monkeypatch):
     """Nothing but the file helps against a power cut."""
-    monkeypatch.setattr(lattice, "NODES", 60)
+    monkeypatch.setattr(shared_lattice, "NODES", 60)
     monkeypatch.setattr(command, "SAVE_SECONDS", 0.0)
     kept = []
     true_save = command.save_landscape

@@ -13,7 +13,7 @@ import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import POSE_NORMS, pose_energy, waypoint_loss
 from tdf_jax.energy.reference import Reference
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 
 HALF = np.sqrt(0.5)
 QUARTER_TURN_Z = [HALF, 0, 0, HALF]
@@ -65,8 +65,8 @@ def original_exponential(v):
     ("exponential", "precision", "loss_tolerance", "gradient_tolerance"),
     [
         (original_exponential, "float64", 1e-10, 1e-10),
-        (poses.exp, "float64", 1e-7, 1e-5),
-        (poses.exp, "float32", 1e-4, 5e-3),
+        (se3.exp, "float64", 1e-7, 1e-5),
+        (se3.exp, "float32", 1e-4, 5e-3),
     ],
     indirect=["precision"],
 )
@@ -78,7 +78,7 @@ def test_the_loss_of_every_waypoint_and_its_gradients_are_the_originals(
 
     def losses(rotation_vectors, t, query, v_ref, t_ref):
         def one(v, t, v_ref, t_ref):
-            descriptors = first.descriptors(poses.rotate(exponential(v_ref), query) + t_ref)
+            descriptors = first.descriptors(se3.rotate(exponential(v_ref), query) + t_ref)
             return waypoint_loss(exponential(v), t, second, query, descriptors)
 
         each = jax.vmap(one)(rotation_vectors, t, v_ref, t_ref)
@@ -108,7 +108,7 @@ def coordinates_reference(query, *rows):
     """The reference of poses that are relative to the demonstrated object's origin already."""
     target = trajectory(*rows)
     query = jnp.asarray(query, jnp.float32)
-    return Reference(poses.transform(target.wxyz_xyz, query), target, query)
+    return Reference(se3.transform(target.wxyz_xyz, query), target, query)
 
 
 def test_equation_2_is_the_mean_absolute_difference():
@@ -264,7 +264,7 @@ def gradient(request):
 
     def energy(variables, rotations, field, reference):
         turns, t = variables
-        R = poses.exp(turns) @ rotations
+        R = se3.exp(turns) @ rotations
         losses = jax.vmap(waypoint_loss, in_axes=(0, 0, None, None, 0))
         each = losses(R, t, field, reference.query, reference.descriptors)
         return jnp.mean(each) + pose_energy(R, t, field.origin, reference, weights)

@@ -17,7 +17,7 @@ from tdf_jax.evaluation.baselines import (
 )
 from tdf_jax.evaluation.cases import mug_case
 from tdf_jax.evaluation.pick_transfer import place_errors
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 
 
 def motion(seed):
@@ -96,7 +96,7 @@ def test_the_place_is_carried_with_the_object(monkeypatch, method):
     assert distance.max() < 1e-6 and angle.max() < 0.1
     if method == "ICP":
         assert len(seen[0]) == 4 and np.abs(seen[0] - seen[1]).max() > 0.1
-        turns = poses.rotation_distance(
+        turns = se3.rotation_distance(
             jax.numpy.asarray(seen[0], "float32"), jax.numpy.asarray(case.T_world_b[:3, :3], "float32")
         )
         assert turns.min() > 0.01  # no start is the answer

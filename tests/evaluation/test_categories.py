@@ -19,7 +19,7 @@ from tdf_jax.evaluation.annotated_meshes import AnnotatedMesh
 from tdf_jax.evaluation.cases import generated_case, mesh_case, object_of, size_of
 from tdf_jax.evaluation.pick_transfer import place_errors, tilts
 from tdf_jax.evaluation.statistics import summary
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.symmetry import FOLDS, about_z
 from tdf_jax.shapes import FAMILIES
 from tdf_jax.viz import contact_sheet as sheet
@@ -31,7 +31,7 @@ def run(*words):
 
 def pose_of(T):
     T = np.asarray(T, np.float32)
-    return np.asarray(poses.pose(T[:3, :3], T[:3, 3]))
+    return np.asarray(se3.pose(T[:3, :3], T[:3, 3]))
 
 
 @pytest.fixture(scope="module")

@@ -35,7 +35,7 @@ from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.model import ModelInfo
 from tdf_jax.shapes import HANDLE_STYLES, MugParameters, build_mug, sample_mug, scaled
-from tdf_jax.uncertainty import calibration as sure
+from tdf_jax.uncertainty import calibration
 
 KEY = jax.random.key(5)
 SEED, INITS = 3, 2
@@ -814,25 +814,26 @@ def picks(number, truth):
 
 def test_calibrated_confidences_have_a_small_error_and_boasting_ones_a_large():
     honest, boasting = (
-        sure.calibration_error(sure.bins(*picks(8000, truth))) for truth in (lambda p: p, lambda p: 0.3 * p)
+        calibration.calibration_error(calibration.bins(*picks(8000, truth)))
+        for truth in (lambda p: p, lambda p: 0.3 * p)
     )
     assert honest < 0.02 and boasting == pytest.approx(0.7 * 0.5, abs=0.02)
 
 
 def test_the_error_weighs_bins_by_their_picks():
     rows = [{"picks": 3, "predicted": 0.5, "right": 0.4}, {"picks": 1, "predicted": 0.2, "right": 0.7}]
-    assert sure.calibration_error(rows) == pytest.approx((3 * 0.1 + 0.5) / 4)
+    assert calibration.calibration_error(rows) == pytest.approx((3 * 0.1 + 0.5) / 4)
 
 
 @pytest.mark.parametrize("number", [1, 5, 400])
 def test_bins_are_of_picks_between_edges_and_none_is_empty(number):
     """An edge begins the bin above it; the last has 1 too."""
-    edges = sure.EDGES
+    edges = calibration.EDGES
     assert (edges[0], edges[-1]) == (0, 1) and 0.25 in edges and list(edges) == sorted(edges)
     predicted, right = picks(number, lambda p: p)
     predicted = np.concatenate([predicted, [0.25, 1.0]])
     right = np.concatenate([right, [0.0, 1.0]])
-    rows = sure.bins(predicted, right)
+    rows = calibration.bins(predicted, right)
     assert sum(row["picks"] for row in rows) == len(predicted)
     chosen = [(predicted >= low) & ((predicted < high) | (high == 1)) for low, high in zip(edges, edges[1:])]
     for row, mine in zip(rows, [one for one in chosen if one.any()], strict=True):
@@ -853,20 +854,20 @@ def test_the_ranking_is_the_share_of_pairs_in_order():
         for b, y in zip(predicted, right)
         if x > y
     ]
-    assert sure.ranking(predicted, right) == pytest.approx(sum(counted) / len(counted))
-    assert sure.ranking(np.array([0.1, 0.2, 0.8]), np.array([0.0, 0.0, 1.0])) == 1.0
-    assert sure.ranking(predicted, np.ones(60)) is None and sure.ranking(predicted, np.zeros(60)) is None
+    assert calibration.ranking(predicted, right) == pytest.approx(sum(counted) / len(counted))
+    assert calibration.ranking(np.array([0.1, 0.2, 0.8]), np.array([0.0, 0.0, 1.0])) == 1.0
+    assert calibration.ranking(predicted, np.ones(60)) is None and calibration.ranking(predicted, np.zeros(60)) is None
 
 
 @pytest.mark.parametrize(("intercept", "slope"), [(-3.0, 2.5), (0.5, 1.0), (-6.0, 5.0)])
 def test_the_fit_recovers_what_the_confidences_were_made_with(monkeypatch, intercept, slope):
     """So it is of the very formula that gives confidences."""
-    monkeypatch.setattr(sure, "MOST", 1.0)
+    monkeypatch.setattr(calibration, "MOST", 1.0)
     rng = np.random.default_rng(0)
     residual = np.exp(rng.normal(-1.0, 0.6, 4000))
-    right = (rng.uniform(size=4000) < [sure.confidence(one, intercept, slope) for one in residual]).astype(float)
+    right = (rng.uniform(size=4000) < [calibration.confidence(one, intercept, slope) for one in residual]).astype(float)
     assert 200 < right.sum() < 3800
-    assert sure.fit(residual, right) == pytest.approx((intercept, slope), abs=0.3 + 0.05 * slope)
+    assert calibration.fit(residual, right) == pytest.approx((intercept, slope), abs=0.3 + 0.05 * slope)
 
 
 def test_the_fit_is_of_maximal_likelihood():
@@ -877,19 +878,19 @@ def test_the_fit_is_of_maximal_likelihood():
     def loss(w):
         return np.sum(np.logaddexp(0, np.where(right == 1, -1, 1) * (w[0] - w[1] * np.log(residual))))
 
-    assert sure.fit(residual, right) == pytest.approx(minimize(loss, np.zeros(2)).x, rel=1e-3)
+    assert calibration.fit(residual, right) == pytest.approx(minimize(loss, np.zeros(2)).x, rel=1e-3)
 
 
 def test_the_fit_stays_finite_where_right_and_wrong_do_not_overlap():
-    intercept, slope = sure.fit(np.array([0.1, 0.11, 0.12, 0.4, 0.5, 0.6]), np.array([1.0, 1, 1, 0, 0, 0]))
+    intercept, slope = calibration.fit(np.array([0.1, 0.11, 0.12, 0.4, 0.5, 0.6]), np.array([1.0, 1, 1, 0, 0, 0]))
     assert np.isfinite([intercept, slope]).all() and slope > 0
 
 
 def test_the_default_curve_is_the_fitted_one():
     assert (
-        sure.confidence(0.5)
-        == sure.confidence(0.5, sure.INTERCEPT, sure.SLOPE)
-        == pytest.approx(1 / (1 + 0.5**sure.SLOPE * np.exp(-sure.INTERCEPT)))
+        calibration.confidence(0.5)
+        == calibration.confidence(0.5, calibration.INTERCEPT, calibration.SLOPE)
+        == pytest.approx(1 / (1 + 0.5**calibration.SLOPE * np.exp(-calibration.INTERCEPT)))
     )
 
 
@@ -919,7 +920,7 @@ def test_the_residual_of_the_demonstrated_object_itself_is_0(model, task, values
 
 def test_confidence_falls_as_the_match_gets_worse_and_is_a_probability():
     residuals = (0.0, 1e-12, 1e-3, *np.geomspace(0.05, 1e2, 30))
-    found = [sure.confidence(one) for one in residuals]
+    found = [calibration.confidence(one) for one in residuals]
     # of 288 picks it was fitted on, none can be surer
     assert found[0] == max(found) == 0.99 and found[-1] < 0.05 and min(found) >= 0
     assert all(a >= b for a, b in zip(found, found[1:]))
@@ -928,7 +929,7 @@ def test_confidence_falls_as_the_match_gets_worse_and_is_a_probability():
 
 
 def test_confidence_is_none_where_there_is_no_residual():
-    assert sure.confidence(float("nan")) is None and sure.confidence(float("inf")) is None
+    assert calibration.confidence(float("nan")) is None and calibration.confidence(float("inf")) is None
     assert np.isnan(pick_residual(0.5, np.ones((1, 5))))  # one query point
 
 

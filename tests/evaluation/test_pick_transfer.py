@@ -17,13 +17,13 @@ from tdf_jax.evaluation.conditions import CONDITIONS, NOISE
 from tdf_jax.evaluation.metrics import expected_trajectory, path_error, pose_error
 from tdf_jax.evaluation.pick_transfer import QUERY_SIZE, overlaps, place_errors, transferred
 from tdf_jax.evaluation.statistics import summary
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.sampling import sample_surface
 
 
 def rigid(rotation_vector, translation):
     T = np.eye(4)
-    T[:3, :3] = poses.exp(jnp.asarray(rotation_vector, jnp.float32))
+    T[:3, :3] = se3.exp(jnp.asarray(rotation_vector, jnp.float32))
     T[:3, 3] = translation
     return T
 
@@ -31,11 +31,11 @@ def rigid(rotation_vector, translation):
 def test_the_expected_trajectory_goes_from_the_carried_pick_to_the_goal():
     shown = tdf.line(5, start=(0.05, 0, 0), end=(0.05, 0.4, 0))
     place_a, place_b = rigid([0, 0, 0], [0.05, 0, 0]), rigid([0, 0, np.pi / 2], [0.0, 0.07, 0.2])
-    goal = poses.pose(jnp.eye(3), jnp.array([0.05, 0.4, 0.3]))
+    goal = se3.pose(jnp.eye(3), jnp.array([0.05, 0.4, 0.3]))
     expected = expected_trajectory(shown, place_a, place_b, goal)
     np.testing.assert_allclose(expected.translations[0], [0.0, 0.07, 0.2], atol=1e-6)  # the handle goes to the handle
     np.testing.assert_allclose(expected.wxyz_xyz[-1], goal, atol=1e-6)
-    turns = poses.rotation_distance(expected.rotations, jnp.eye(3)[None])
+    turns = se3.rotation_distance(expected.rotations, jnp.eye(3)[None])
     np.testing.assert_allclose(turns, np.linspace(np.pi / 2, 0, 5), atol=1e-6)
     # Half way: the mean of where the pick's motion (x, y -> -y, x + ...) and the goal's (0.3 m up) carry (0.05, 0.2,
     # 0).
@@ -47,7 +47,7 @@ def test_the_expected_trajectory_goes_from_the_carried_pick_to_the_goal():
 def test_the_same_object_moved_is_expected_to_carry_its_trajectory():
     shown, moved = tdf.wave(6), rigid([0.3, -0.8, 0.5], [0.1, 0.2, 0.3])
     place = rigid([0, 0.4, 0], [0.05, 0, 0.02])
-    carried = shown.transformed(poses.pose(jnp.asarray(moved[:3, :3]), jnp.asarray(moved[:3, 3])))
+    carried = shown.transformed(se3.pose(jnp.asarray(moved[:3, :3]), jnp.asarray(moved[:3, 3])))
     expected = expected_trajectory(shown, place, moved @ place, carried.wxyz_xyz[-1])
     distance, angle = pose_error(expected.wxyz_xyz, carried.wxyz_xyz)
     assert distance.max() < 1e-6 and angle.max() < 1e-3

@@ -9,7 +9,7 @@ from conftest import carried, enabled, random_cloud, random_poses
 
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
-from tdf_jax.geometry import distance_fields as obstacles, se3
+from tdf_jax.geometry import distance_fields, se3
 from tdf_jax.geometry.distance_fields import DistanceGrid, box_obstacle, cloud_obstacle, mesh_obstacle
 from tdf_jax.planning import occupied
 from tdf_jax.planning.occupied import field_obstacle
@@ -209,7 +209,7 @@ def test_every_obstacle_is_a_pytree_that_compiles():
     box = box_obstacle((0, 0, 0), SIZE)
     grid = DistanceGrid(jnp.zeros(3), jnp.array(0.5), jnp.ones((2, 2, 2)))
     for obstacle in (box, grid):
-        assert isinstance(obstacle, obstacles.Box | obstacles.DistanceGrid)
+        assert isinstance(obstacle, distance_fields.Box | distance_fields.DistanceGrid)
         x = jnp.asarray([[0.3, 0.2, 0.1]])
         np.testing.assert_allclose(
             jax.jit(lambda obstacle: obstacle.distance(x))(obstacle), obstacle.distance(x), rtol=1e-6

@@ -11,17 +11,17 @@ from conftest import compilations, random_cloud, random_poses
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import waypoint_loss
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.grid import Grid, path_grid, plane_grid, volume_grid
-from tdf_jax.landscape import shared_lattice as lattice
+from tdf_jax.landscape import shared_lattice
 from tdf_jax.landscape.energy_grid import blank, energy_landscape, fill, query_change
 
-RANDOM = np.asarray(poses.rotation(jnp.asarray(random_poses(5, 3), jnp.float32)))
+RANDOM = np.asarray(se3.rotation(jnp.asarray(random_poses(5, 3), jnp.float32)))
 
 
 def one_by_one(field, reference, grid, R, index):
     """Every waypoint's energy at a grid point: that of a trajectory of one pose, without the correlation term."""
-    at = tdf.Trajectory(poses.pose(jnp.asarray(R, jnp.float32), jnp.asarray(grid.points[index], jnp.float32))[None])
+    at = tdf.Trajectory(se3.pose(jnp.asarray(R, jnp.float32), jnp.asarray(grid.points[index], jnp.float32))[None])
     alone = [dataclasses.replace(reference, descriptors=one[None], trajectory=at) for one in reference.descriptors]
     return np.array([tdf.trajectory_energy(at, field, one, tdf.EnergyWeights(0.0)) for one in alone])
 
@@ -42,7 +42,7 @@ def lattice_reference(small_model, demonstration):
 def small_tiles(monkeypatch):
     """Several tiles and chunks even of small grids, and blocks of channels that do not come out even."""
     for name, value in {"NODES": 60, "CHUNK_POINTS": 40, "UNROLLED": 5}.items():
-        monkeypatch.setattr(lattice, name, value)
+        monkeypatch.setattr(shared_lattice, name, value)
 
 
 @pytest.mark.parametrize("R", [None, RANDOM[0]], ids=["upright", "turned"])
@@ -59,7 +59,7 @@ def test_shared_energies_equal_those_of_single_poses(field, lattice_reference, a
     count = {"line": 1, "plane": 2, "volume": 3}[axes]
     coordinates = tuple(0.012 * np.arange(-2, size) for size in (4, 3, 7)[:count])
     grid = Grid(np.asarray(field.origin) + 0.05, R.T[:count].astype(float), coordinates)
-    layers = lattice.layers(grid, np.asarray(lattice_reference.query) @ R.T)
+    layers = shared_lattice.layers(grid, np.asarray(lattice_reference.query) @ R.T)
     assert len(layers.offsets) == {"line": 6, "plane": 2, "volume": 1}[axes]
     landscape = energy_landscape(field, lattice_reference, grid, R)
     corner = tuple(size - 1 for size in grid.shape)

@@ -11,7 +11,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from scipy.spatial import cKDTree
 
 import tdf_jax as tdf
-from tdf_jax.networks import occupancy as network, vector_neurons
+from tdf_jax.networks import occupancy, vector_neurons
 from tdf_jax.networks.occupancy import condition, decode
 from tdf_jax.networks.vector_neurons import EdgeConvolution, nearest_neighbours
 
@@ -150,7 +150,7 @@ def test_nearest_neighbours_far_from_the_origin():
 
 def test_published_sizes():
     assert tdf.NetworkConfig().channels == 2049
-    assert network.parameter_count(tdf.NetworkConfig()) == 1_757_185
+    assert occupancy.parameter_count(tdf.NetworkConfig()) == 1_757_185
 
 
 def test_a_decoder_is_one_function_of_the_point(small_model):

@@ -8,7 +8,7 @@ from conftest import compilations, enabled, random_cloud, random_poses
 
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.networks import refinement
 
 
@@ -34,7 +34,7 @@ def test_the_points_come_to_lie_on_the_surface(mug):
 
 def test_a_refined_field_moves_and_turns_with_the_points(mug):
     model, field, points = mug
-    R, shift = np.asarray(poses.rotation(random_poses(3, 1)[0]), np.float32), np.array([0.3, -0.1, 0.2], np.float32)
+    R, shift = np.asarray(se3.rotation(random_poses(3, 1)[0]), np.float32), np.array([0.3, -0.1, 0.2], np.float32)
     latent, turned = (
         field.latent,
         tdf.DescriptorField(

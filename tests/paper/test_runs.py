@@ -14,7 +14,7 @@ import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.metrics import shape_error
 from tdf_jax.geometry.grid import distance_from_polyline
-from tdf_jax.paper import figure2 as landscapes, figures, setting as settings, table
+from tdf_jax.paper import energy_maps, figures, setting as settings, table
 from tdf_jax.paper.runs import Run, imitation
 from tdf_jax.paper.setting import Setting
 from tdf_jax.paper.store import Store
@@ -397,7 +397,7 @@ def test_the_turn_along_a_path_is_the_angle_from_the_demonstration():
 def test_landscapes_are_of_the_named_mug_with_the_demonstrations_orientation(small_model):
     """On its own mug, the demonstration's waypoints are the minimisers, to the pitch of the grid."""
     base = dataclasses.replace(TINY, queries=4, seed=2)
-    own = landscapes.figure2(small_model, base, "reference mug", 25)
+    own = energy_maps.figure2(small_model, base, "reference mug", 25)
     assert set(own) == {"line", "semicircle", "wave"}
     for panel in own.values():
         assert panel.energies.shape == (25, 25)
@@ -407,7 +407,7 @@ def test_landscapes_are_of_the_named_mug_with_the_demonstrations_orientation(sma
     assert line.energies[12, 12] < 1e-6  # the first waypoint is a point of the grid
     np.testing.assert_allclose(line.minimisers[0], 0, atol=1e-9)
     np.testing.assert_allclose(line.carried, line.path)
-    others = {name: landscapes.figure2(small_model, base, name, 5)["wave"] for name in landscapes.FIELDS}
+    others = {name: energy_maps.figure2(small_model, base, name, 5)["wave"] for name in energy_maps.FIELDS}
     turned = others["reference mug, turned"]
     flat = [panel.path - panel.outline.mean(axis=0) for panel in (own["wave"], turned)]
     R = Rotation.from_euler("z", 60, degrees=True).as_matrix()[:2, :2]
@@ -417,7 +417,7 @@ def test_landscapes_are_of_the_named_mug_with_the_demonstrations_orientation(sma
         (own["wave"].outline - own["wave"].outline.mean(axis=0)) @ R.T,
         atol=1e-5,
     )
-    mean = landscapes.figure2(small_model, dataclasses.replace(base, field_energy="mean"), "reference mug", 5)["wave"]
+    mean = energy_maps.figure2(small_model, dataclasses.replace(base, field_energy="mean"), "reference mug", 5)["wave"]
     assert (mean.energies > others["reference mug"].energies).all()
     outlines = [panel.outline for panel in others.values()]
     assert all(np.abs(a - b).max() > 0.01 for i, a in enumerate(outlines) for b in outlines[:i])

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.reference import Reference
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.networks.field import DescriptorField
 from tdf_jax.networks.occupancy import condition, parameter_shapes
 from tdf_jax.solvers.adam import _begin, _run
@@ -39,15 +39,15 @@ def energies(field, reference):
 
     def energy(variables, rotations):
         turns, places = variables
-        R = poses.exp(turns) @ rotations
+        R = se3.exp(turns) @ rotations
         t = places - R @ jnp.mean(reference.query, axis=0)
-        return tdf.trajectory_energy(tdf.Trajectory(poses.pose(R, t)), field, reference, WEIGHTS)
+        return tdf.trajectory_energy(tdf.Trajectory(se3.pose(R, t)), field, reference, WEIGHTS)
 
     each = jax.jit(jax.vmap(jax.value_and_grad(energy)))
 
     def of(trajectories):
-        rotations = poses.rotation(trajectories)
-        places = poses.transform(trajectories, jnp.mean(reference.query, axis=0)[None])[..., 0, :]
+        rotations = se3.rotation(trajectories)
+        places = se3.transform(trajectories, jnp.mean(reference.query, axis=0)[None])[..., 0, :]
         return each((jnp.zeros_like(places), places), rotations)
 
     return of
@@ -83,9 +83,9 @@ def test_the_first_step_has_the_rates_of_the_settings(field, reference):
     config = dataclasses.replace(CONFIG, iterations=1, rotation_rate=0.02, translation_rate=0.003)
     result = run(field, reference, config=config)
     centre = jnp.mean(reference.query, axis=0)[None]
-    moved = poses.transform(result.trajectories, centre) - poses.transform(result.starts, centre)
+    moved = se3.transform(result.trajectories, centre) - se3.transform(result.starts, centre)
     np.testing.assert_allclose(np.abs(moved[:, :-1]), 0.003, rtol=0.01)
-    turned = poses.rotation_distance(poses.rotation(result.trajectories), poses.rotation(result.starts))
+    turned = se3.rotation_distance(se3.rotation(result.trajectories), se3.rotation(result.starts))
     np.testing.assert_allclose(turned[:, :-1], 0.02 * np.sqrt(3), rtol=0.01)
 
 
@@ -97,7 +97,7 @@ def test_rates_fall_as_a_cosine(field, reference):
     result = run(field, reference, config=config, energy=tdf.EnergyWeights(1e3, lever=0.0), starts=far)
     decay = 0.1 + 0.9 * (1 + np.cos(np.pi * np.arange(25) / 25)) / 2
     centre = jnp.mean(reference.query, axis=0)[None]
-    moved = poses.transform(result.trajectories, centre) - poses.transform(result.starts, centre)
+    moved = se3.transform(result.trajectories, centre) - se3.transform(result.starts, centre)
     np.testing.assert_allclose(moved[:, :-1], -0.004 * decay.sum(), rtol=0.02)
 
 
@@ -175,7 +175,7 @@ def test_carried_starts_turn_the_demonstration_about_the_object(field, reference
 
 def test_scattered_starts_lie_about_the_object(field, reference):
     starts = random_starts(KEY, field, reference, 64, "scattered", 0.1)
-    centres = poses.transform(starts, jnp.mean(reference.query, axis=0)[None])[..., 0, :]
+    centres = se3.transform(starts, jnp.mean(reference.query, axis=0)[None])[..., 0, :]
     distances = np.linalg.norm(centres - field.origin, axis=-1)
     assert distances.max() < 0.1 + 1e-6
     assert 0.07 < distances.mean() < 0.08  # uniform in the ball: three quarters of the radius

@@ -15,7 +15,7 @@ if several:
     jax.distributed.initialize(f'127.0.0.1:{sys.argv[2]}', num_processes=2, process_id=int(sys.argv[3]))
 import tdf_jax as tdf
 from conftest import SMALL, random_cloud
-from tdf_jax.landscape import shared_lattice as lattice
+from tdf_jax.landscape import shared_lattice
 from tdf_jax.networks.occupancy import initialise
 
 assert (len(jax.devices()), len(jax.local_devices())) == (8, 4 if several else 8)
@@ -37,7 +37,7 @@ for config, rows in ((tdf.OptimizeConfig(inits=11, iterations=5), 11), (tdf.Solv
         np.testing.assert_allclose(getattr(many, name), getattr(one, name), rtol=1e-5, atol=1e-5, err_msg=f'{minimise.__name__} {name}')
 assert calls == [(11,)] + [(2,)] * 6
 
-lattice.NODES, used, kept = 60, set(), lattice._tile
+shared_lattice.NODES, used, kept = 60, set(), shared_lattice._tile
 def noted(*arguments):
     found = kept(*arguments)
     used.update(found.devices())
@@ -45,7 +45,7 @@ def noted(*arguments):
 shown = tdf.describe(model, tdf.Demonstration(cloud, path, tdf.lattice_query((2, 2, 2), 0.02)))
 grid = tdf.plane_grid(0.2, 21)
 one = tdf.energy_landscape(field, shown, grid)
-lattice._tile = noted
+shared_lattice._tile = noted
 tiles = []
 many = tdf.energy_landscape(field, shown, grid, mesh=mesh, progress=lambda done, total: tiles.append(total))
 np.testing.assert_allclose(many.values, one.values, rtol=1e-5)

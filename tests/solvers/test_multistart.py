@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import pose_energy, waypoint_loss
-from tdf_jax.geometry import se3 as poses
-from tdf_jax.solvers import gauss_newton as descent
+from tdf_jax.geometry import se3
+from tdf_jax.solvers import gauss_newton
 from tdf_jax.solvers.initial import default_goal, random_starts
 from tdf_jax.solvers.multistart import Candidates, SolveConfig
 
@@ -45,7 +45,7 @@ def energy_of(trajectories, field, reference, weights=WEIGHTS):
 
 
 def moved(R, place, step):
-    return poses.exp(step[:3]) @ R, place + step[3:]
+    return se3.exp(step[:3]) @ R, place + step[3:]
 
 
 @pytest.mark.parametrize("pose_norm", ["frobenius", "metres_radians", "mean_absolute"])
@@ -58,7 +58,7 @@ def test_energies_and_gradients_are_those_of_the_energy(field, reference, pose_n
     drawn = solve._candidates(starts, problem)
     R, place = drawn.R.reshape(-1, 3, 3), drawn.place.reshape(-1, 3)
     waypoint = np.tile(np.arange(4), 5)
-    values = descent._evaluate(R, place, waypoint, np.array([20, 20, 3, 0]), field, problem, weights, 128)
+    values = gauss_newton._evaluate(R, place, waypoint, np.array([20, 20, 3, 0]), field, problem, weights, 128)
 
     def energy(step, R, place, index):
         R, place = moved(R, place, step)
@@ -90,7 +90,7 @@ def test_the_curvature_is_that_of_reweighted_squares(field, reference):
     size = np.abs(value)
     weights = 1 / np.maximum(size, size.mean(axis=-1, keepdims=True)) / value.size
     expected = np.einsum("qca,qc,qcb->ab", jacobian, weights, jacobian)
-    _, _, hessian = descent._match(R, place, field, problem.query[0], problem.weights[0] / 8, shown)
+    _, _, hessian = gauss_newton._match(R, place, field, problem.query[0], problem.weights[0] / 8, shown)
     np.testing.assert_allclose(hessian[0], expected, atol=1e-4 * np.abs(expected).max())
 
 
@@ -98,19 +98,19 @@ def test_a_step_solves_the_damped_system_and_is_bounded():
     rng = np.random.default_rng(0)
     half = rng.normal(size=(4, 6, 6))
     hessian, gradient = half @ half.swapaxes(1, 2) + np.eye(6), 1e-3 * rng.normal(size=(4, 6))
-    state = descent._State(
+    state = gauss_newton._State(
         jnp.zeros((4, 3, 3)), jnp.zeros((4, 3)), jnp.ones(4), jnp.float32(gradient), jnp.float32(hessian)
     )
     damping = jnp.array([0.1, 1.0, 0.0, 10.0])
-    step, promise = descent._step(state, damping)
+    step, promise = gauss_newton._step(state, damping)
     damped = hessian + np.asarray(damping)[:, None, None] * hessian * np.eye(6)
     expected = -np.linalg.solve(damped, gradient[..., None])[..., 0]
     np.testing.assert_allclose(step, expected, rtol=1e-3, atol=1e-7)
     fall = -(gradient * expected).sum(axis=1) - np.einsum("ca,cab,cb->c", expected, hessian, expected) / 2
     np.testing.assert_allclose(promise, fall, rtol=1e-3)
-    long, _ = descent._step(state._replace(gradient=1e4 * state.gradient), damping)
-    assert np.linalg.norm(long[:, :3], axis=1).max() <= descent.LARGEST_TURN * (1 + 1e-6)
-    assert np.linalg.norm(long[:, 3:], axis=1).max() <= descent.LARGEST_MOVE * (1 + 1e-6)
+    long, _ = gauss_newton._step(state._replace(gradient=1e4 * state.gradient), damping)
+    assert np.linalg.norm(long[:, :3], axis=1).max() <= gauss_newton.LARGEST_TURN * (1 + 1e-6)
+    assert np.linalg.norm(long[:, 3:], axis=1).max() <= gauss_newton.LARGEST_MOVE * (1 + 1e-6)
     cosine = (long * expected).sum(axis=1) / np.linalg.norm(long, axis=1) / np.linalg.norm(expected, axis=1)
     np.testing.assert_allclose(cosine, 1, atol=1e-4)
 
@@ -128,7 +128,9 @@ def test_chunks_do_not_show(field, reference):
         WEIGHTS,
     )
     # 3 poses at a time: the last chunk overlaps the one before.
-    for part, expected in zip(descent._evaluate(*settings, 9), descent._evaluate(*settings, 128), strict=True):
+    for part, expected in zip(
+        gauss_newton._evaluate(*settings, 9), gauss_newton._evaluate(*settings, 128), strict=True
+    ):
         np.testing.assert_allclose(part, expected, rtol=1e-4, atol=1e-6)
 
 

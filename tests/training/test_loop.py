@@ -12,7 +12,7 @@ import pytest
 from tdf_jax._internal.errors import InputError
 from tdf_jax.networks.occupancy import NetworkConfig, parameter_shapes
 from tdf_jax.solvers.adam import OptimizeConfig
-from tdf_jax.training import dataset, loop, run_folder as record
+from tdf_jax.training import dataset, loop, run_folder
 from tdf_jax.training.config import TrainConfig
 from tdf_jax.training.dataset import Recipe, joined
 from tdf_jax.training.objective import FRONT, UP, frame_error
@@ -212,7 +212,7 @@ def test_metrics_cut_short_anywhere_are_dropped(tmp_path):
     whole, row = '{"step": 1, "loss": 2.0}', '{"step": 2, "loss": 1.0, "validation": {"iou": 0.5}}'
     for cut in range(1, len(row)):
         (tmp_path / "metrics.jsonl").write_text(whole + "\n" + row[:cut])
-        record.drop_later_metrics(tmp_path, 2)
+        run_folder.drop_later_metrics(tmp_path, 2)
         assert (tmp_path / "metrics.jsonl").read_text() == whole + "\n"
 
 
@@ -252,7 +252,7 @@ def test_minutes_become_steps(sets, monkeypatch):
 
 
 def test_curves_show_training_and_both_validations(whole):
-    rows = record.metrics(whole[0])
+    rows = run_folder.metrics(whole[0])
     panels = training_figure(rows).axes
     assert len(panels) == 4
     for panel, name in zip(panels, ("bce", "iou", "frame", "place")):
@@ -402,15 +402,15 @@ def test_bad_settings_are_refused_before_any_work(bad):
 def test_a_damaged_run_is_refused(tmp_path):
     (tmp_path / "config.json").write_text("{")
     with pytest.raises(InputError, match="config.json cannot be read"):
-        record.claim(tmp_path, {})
+        run_folder.claim(tmp_path, {})
     (tmp_path / "state.msgpack").write_bytes(b"\x93\x01")
     with pytest.raises(InputError, match="state.msgpack cannot be read"):
-        record.restore(tmp_path, {}, {})
+        run_folder.restore(tmp_path, {}, {})
 
 
 def test_a_checkpoint_of_another_architecture_is_refused(tmp_path):
-    record.save(tmp_path, {"kernel": np.zeros((3, 4))}, {}, 7)
-    _, _, step = record.restore(tmp_path, {"kernel": np.ones((3, 4))}, {})
+    run_folder.save(tmp_path, {"kernel": np.zeros((3, 4))}, {}, 7)
+    _, _, step = run_folder.restore(tmp_path, {"kernel": np.ones((3, 4))}, {})
     assert step == 7
     with pytest.raises(InputError, match="state.msgpack is a checkpoint of another network"):
-        record.restore(tmp_path, {"kernel": np.ones((4, 4))}, {})
+        run_folder.restore(tmp_path, {"kernel": np.ones((4, 4))}, {})

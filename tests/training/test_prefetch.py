@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tdf_jax._internal.errors import InputError
-from tdf_jax.training import dataset, prefetch as ahead
+from tdf_jax.training import dataset, prefetch
 from tdf_jax.training.config import TrainConfig
 from tdf_jax.training.dataset import Recipe, joined
 from tdf_jax.training.loop import batch_of
@@ -51,7 +51,7 @@ def failing(data, step):
 def test_batches_come_in_the_order_of_steps_and_do_not_depend_on_who_draws_them(data, workers):
     batch = functools.partial(batch_of, CONFIG, gradual=False)
     with drawn_ahead(batch, data, 5, workers) as batches:
-        for step in range(5, 5 + 2 * ahead.AHEAD * workers + 1):
+        for step in range(5, 5 + 2 * prefetch.AHEAD * workers + 1):
             for found, expected in zip(
                 dataclasses.astuple(next(batches)), dataclasses.astuple(batch(data, step)), strict=True
             ):
@@ -119,7 +119,7 @@ def test_no_workers_are_refused(data):
 
 
 def test_a_cpu_draws_in_a_thread_and_beside_an_accelerator_every_core_draws(monkeypatch):
-    monkeypatch.setattr(ahead.os, "cpu_count", lambda: 6)
+    monkeypatch.setattr(prefetch.os, "cpu_count", lambda: 6)
     for on_a_cpu, expected in ((True, 1), (False, 6)):
-        monkeypatch.setattr(ahead, "one_at_a_time", lambda on_a_cpu=on_a_cpu: on_a_cpu)
-        assert ahead.usual_workers() == expected
+        monkeypatch.setattr(prefetch, "one_at_a_time", lambda on_a_cpu=on_a_cpu: on_a_cpu)
+        assert prefetch.usual_workers() == expected

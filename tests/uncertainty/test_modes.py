@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import waypoint_loss
-from tdf_jax.geometry import se3 as poses
+from tdf_jax.geometry import se3
 from tdf_jax.uncertainty import covariance as covariance_module
 from tdf_jax.uncertainty.covariance import pose_covariance
 from tdf_jax.uncertainty.modes import cluster_poses
@@ -143,7 +143,7 @@ def squares(weights):
     """Field, reference and a pose with its query points along the world's axes, and the curvatures there of turns and moves."""
     arms = np.concatenate([np.diag(EXTENTS), -np.diag(EXTENTS)])
     query = jnp.asarray(arms @ R_WORLD_QUERY + OFFSET, jnp.float32)
-    pose = poses.pose(jnp.asarray(R_WORLD_QUERY, jnp.float32), jnp.asarray(-R_WORLD_QUERY @ OFFSET, jnp.float32))
+    pose = se3.pose(jnp.asarray(R_WORLD_QUERY, jnp.float32), jnp.asarray(-R_WORLD_QUERY @ OFFSET, jnp.float32))
     k, s = np.array(weights), EXTENTS**2 / 3
     turns = [2 * (k[i] - k[j]) * (s[j] - s[i]) / 3 for i, j in ((1, 2), (2, 0), (0, 1))]
     reference = tdf.Reference(jnp.zeros((1, 6, 3)), tdf.Trajectory(pose[None]), query)
@@ -251,11 +251,11 @@ def test_one_sigma_along_the_axes_raises_the_energy_by_the_scale(shown, referenc
     found = pose_covariance(shown, reference, pose, 3, scale=scale)
     sigma = np.sqrt(2 * scale / np.asarray(found.values))
     assert sigma.max() < np.radians(15) * found.lever and sigma.max() > 10 * sigma.min()
-    R, middle = poses.rotation(pose), jnp.mean(reference.query, axis=0)
+    R, middle = se3.rotation(pose), jnp.mean(reference.query, axis=0)
 
     def energy(twist):
         """By turning about the centre in the world, then moving: not as screws, which differs by little here."""
-        turned = poses.exp(twist[:3]) @ R
+        turned = se3.exp(twist[:3]) @ R
         return waypoint_loss(
             turned, found.centre + twist[3:] - turned @ middle, shown, reference.query, reference.descriptors[3]
         )
@@ -368,7 +368,7 @@ def transferred(model, query, points_a, points_b, place):
     """A place shown on one object and found on another, which lies elsewhere: the covariance there."""
     field = tdf.encode(model, points_a.astype(np.float32))
     shown = tdf.Trajectory(
-        poses.pose(jnp.asarray(place[:3, :3], jnp.float32), jnp.asarray(place[:3, 3], jnp.float32))[None]
+        se3.pose(jnp.asarray(place[:3, :3], jnp.float32), jnp.asarray(place[:3, 3], jnp.float32))[None]
     )
     reference = tdf.Reference(tdf.trajectory_descriptor(field, shown, query), shown.shifted(-field.origin), query)
     moved = tdf.encode(model, carried(T_WORLD_OBJECT, points_b).astype(np.float32))

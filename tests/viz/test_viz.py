@@ -7,7 +7,7 @@ import pytest
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.shapes import build_mug
-from tdf_jax.viz import polygons3d as solid
+from tdf_jax.viz import polygons3d
 from tdf_jax.viz.imitation import imitation_figure, loss_figure
 from tdf_jax.viz.style import save_figure
 
@@ -26,8 +26,8 @@ def lines(axes):
 def drawn(monkeypatch):
     """The solid things of each 3-D view, in order."""
     views = []
-    collection = solid.Pieces.collection
-    monkeypatch.setattr(solid.Pieces, "collection", lambda pieces: views.append(pieces) or collection(pieces))
+    collection = polygons3d.Pieces.collection
+    monkeypatch.setattr(polygons3d.Pieces, "collection", lambda pieces: views.append(pieces) or collection(pieces))
     return views
 
 
@@ -84,15 +84,18 @@ def test_a_mesh_is_drawn_instead_of_the_points(demonstration, drawn):
 
 def test_a_surface_is_lit_from_one_side_and_skips_faces_without_area():
     up, upright, flat = np.eye(3), np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1]]), np.zeros((3, 3))
-    pieces = solid.surface(np.array([up, upright, flat], float), np.ones(3) / np.sqrt(3))
+    pieces = polygons3d.surface(np.array([up, upright, flat], float), np.ones(3) / np.sqrt(3))
     assert len(pieces.polygons) == 2
     bright, dim = (np.array(colour[:3]) for colour in pieces.faces)
-    np.testing.assert_allclose(bright, solid.CLAY)
+    np.testing.assert_allclose(bright, polygons3d.CLAY)
     assert (dim < bright).all()
 
 
 def test_a_box_is_twelve_edges_and_its_front():
-    full, dashed = solid.box(solid.CORNERS, "red"), solid.box(solid.CORNERS, "red", filled=False, dashed=True)
+    full, dashed = (
+        polygons3d.box(polygons3d.CORNERS, "red"),
+        polygons3d.box(polygons3d.CORNERS, "red", filled=False, dashed=True),
+    )
     edges = [polygon for polygon in full.polygons if len(polygon) == 2]
     front = np.concatenate([polygon for polygon in full.polygons if len(polygon) == 4])
     assert sum(np.linalg.norm(b - a) for a, b in edges) == pytest.approx(12)
