@@ -38,10 +38,10 @@ def benchmark(
         pairs: tasks on generated mug pairs; 24 are one of each path with each goal; 0 for none, beside --meshes.
         seed: of the mugs, poses, goals, query points and starts.
         height: of generated mugs, metres.
-        clouds: how the new object is seen; see docs/evaluation.md.
+        clouds: how the new object is seen; see docs/guide/evaluation.md.
         methods: some of those on the page, by their names there, or all.
         inits: random starts of Adam and ICP; the library's own solver takes 64 cheap ones.
-        meshes: folder of real mugs and their meshes.json; see docs/evaluation.md.
+        meshes: folder of real mugs and their meshes.json; see docs/guide/evaluation.md.
         poses: random poses of each real mug.
         demonstrations: also measure picks learnt from so many demonstrations, such as 1 3 5 10.
         out: folder for the page; what was computed is kept in its folder runs.

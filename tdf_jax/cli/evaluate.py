@@ -56,7 +56,7 @@ def evaluate(
         clouds: the new object's cloud: full; from 1, 2 or 4 cameras; of 300 to 3000 points; 300 with 2 mm noise; half
             or double size.
         baselines: also random weights, alignment of principal axes and ICP, on the same cases with as many starts.
-        meshes: folder of real objects of these categories and their meshes.json; see docs/evaluation.md.
+        meshes: folder of real objects of these categories and their meshes.json; see docs/guide/evaluation.md.
         poses: random poses of each real object.
         json: write every number to this file.
         card: write a model card in Markdown.

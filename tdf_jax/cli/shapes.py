@@ -20,7 +20,7 @@ def shapes(
         out: .png to write.
         count: of generated objects.
         seed: of their dimensions; training and evaluation draw others.
-        meshes: folder of real objects and their meshes.json, drawn after them; see docs/evaluation.md.
+        meshes: folder of real objects and their meshes.json, drawn after them; see docs/guide/evaluation.md.
     """
     import numpy as np
 

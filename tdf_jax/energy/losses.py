@@ -36,7 +36,7 @@ class EnergyWeights:
         compensator: weight of eq. 6, which the paper tried and rejected.
         lever: metres that a turn of one unit counts as in eq. 3, where the paper does not say. At 1 m, the plain norm,
             a turn outweighs the descriptors of a real, 0.1 m mug by far, and a mug that lies in another orientation is
-            not followed (docs/energy.md).
+            not followed (docs/results/energy.md).
         pose_norm: the norm of eq. 3, which the paper does not specify: "frobenius", of the difference of the 4x4
             matrices, "metres_radians", sqrt(distance^2 + angle^2), or "mean_absolute", over the twelve numbers of (R,
             t), as eq. 2 is over channels.

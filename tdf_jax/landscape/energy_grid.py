@@ -51,7 +51,7 @@ def energy_landscape(
         temperature: of the soft least, in units of the energy.
         share: False evaluates every (grid point, query point) by itself, to compare.
         mesh: devices to share the grid's tiles, of this process or of several that make the same call; see
-            docs/scaling.md.
+            docs/guide/scaling.md.
         progress: called with the number of tiles done and of all.
 
     Raises:

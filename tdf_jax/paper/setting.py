@@ -35,7 +35,7 @@ STREAM = 0x7AB1E1  # of the setting's draws
 @dataclasses.dataclass(frozen=True)
 class Setting:
     """One imitation. The paper gives trajectory, displacement, k, iterations and distance; the rest is read from its figures or left open, and
-    docs/paper.md says why it is as it is.
+    docs/results/paper.md says why it is as it is.
 
     Attributes:
         trajectory: the demonstration's shape, from the handle to a place 0.83 units along y; it bows to +x, the
@@ -50,7 +50,7 @@ class Setting:
             default it is at the handle.
         correlated: what the correlation term pulls towards: the demonstration, or the demonstration stretched to the
             displaced goal, waypoint i of n moved by i / (n - 1) of the displacement.
-        pose_norm: norm of the correlation term, see docs/energy.md.
+        pose_norm: norm of the correlation term, see docs/guide/energy.md.
         lever: metres that a turn of one unit counts as in the correlation term.
         compensator: weight of eq. 6, steps in metres and turns as they are.
         compensator_order: eq. 6 summed over steps ("frobenius"), or its largest step ("infinity").

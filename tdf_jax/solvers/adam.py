@@ -100,7 +100,7 @@ def optimize(
         config: settings.
         starts: use these instead of random ones; their last poses are replaced by the goal only where one is given.
         progress: called between blocks of iterations with the iterations done and the energies; may raise to cancel.
-        mesh: devices to share the starts, of this process or of several that make the same call; see docs/scaling.md.
+        mesh: devices to share the starts, of this process or of several that make the same call; see docs/guide/scaling.md.
 
     Returns:
         All starts' results.

@@ -12,7 +12,7 @@ from tdf_jax.networks.field import DescriptorField
 
 # Logistic in log(residual), fitted on 288 picks whose truth is known, 9 of them wrong: `tdf benchmark --seed 61 --pairs
 # 72 --methods tdf_jax --clouds full views1 views2 noise`, mugs of 0.12 m. Right picks had residuals of 0.08 to 0.53
-# (all but 5 % on either side, by condition), wrong ones 0.44 to 0.83. docs/certainty.md has the reliability on others.
+# (all but 5 % on either side, by condition), wrong ones 0.44 to 0.83. docs/results/uncertainty.md has the reliability on others.
 INTERCEPT, SLOPE = -3.39, 6.55
 FITTED_ON = 61  # seed
 CALIBRATED = ("mug",)  # shipped weights that it was fitted for
@@ -132,7 +132,7 @@ CUT = 3.0  # occupancy logits beyond it count no further: a few stray points mus
 
 # Logistic in (-log residual, surface logit), by name of shipped weights: intercept and two slopes, fitted on right and
 # wrong cases of seed 61 by `python -m bench.recognition --fit`: 40 of each for mugs, 32 for bowls and for bottles, 48
-# for all three. Tried on others: docs/certainty.md.
+# for all three. Tried on others: docs/results/uncertainty.md.
 CURVES = {
     "mug": (-2.77, 6.25, 4.76),
     "bowl": (-28.5, 16.9, -2.35),

@@ -212,7 +212,7 @@ def test_a_free_last_pose_moves_and_another_seed_is_another_experiment(small_mod
 
 
 def test_a_displaced_goal_moves_no_other_pose_unless_the_demonstration_is_stretched(small_model, run):
-    """Each pose has terms of its own only, and the last is held: docs/paper.md says so."""
+    """Each pose has terms of its own only, and the last is held: docs/results/paper.md says so."""
     displaced = dataclasses.replace(TINY, displacement=(-0.2, 0.1, 0.3))
     moved = imitation(small_model, displaced)
     np.testing.assert_array_equal(moved.found[:, :-1], run.found[:, :-1])
