@@ -17,7 +17,7 @@ from tdf_jax.geometry.symmetry import FOLDS
 from tdf_jax.io.meshes import file_axes
 from tdf_jax.shapes import FAMILIES, BottleParameters, BowlParameters, build_bottle, build_bowl, build_mug
 
-DOCS = Path(__file__).parents[2] / "docs" / "evaluation.md"
+DOCS = Path(__file__).parents[2] / "docs" / "guide" / "evaluation.md"
 ENTRY = {"unit": 1, "up": "+z", "handle": "+x"}
 
 
