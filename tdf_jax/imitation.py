@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from tdf_jax._internal.checks import check_key
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import CategoryWarning, InputError
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference, describe
@@ -43,7 +43,7 @@ def imitate(
 
     By default the pick is found by descriptors, and the demonstration is carried from there to the goal. With
     `config=SolveConfig()` or `OptimizeConfig()` the paper's energy, eq. 3, is minimised over all waypoints, by
-    Gauss-Newton steps or by Adam (docs/benchmark.md compares them).
+    Gauss-Newton steps or by Adam (docs/results/benchmark.md compares them).
 
     Clouds denser than the network's training clouds are thinned, see `encode`.
 
@@ -71,7 +71,7 @@ def imitate(
     Raises:
         InputError: bad points, goal, offset or settings, or an energy that `carry` would not use.
     """
-    check_key("imitate()", key)
+    checks.key("imitate()", key)
     if not isinstance(config, CarryConfig | SolveConfig | OptimizeConfig):
         raise InputError(f"imitate(): config is {config!r}; expected a CarryConfig, SolveConfig or OptimizeConfig")
     if isinstance(config, CarryConfig) and energy is not None:
@@ -136,7 +136,7 @@ def imitate_batch(
     Raises:
         InputError: no clouds, or as for `imitate`.
     """
-    check_key("imitate_batch()", key)
+    checks.key("imitate_batch()", key)
     clouds = list(clouds)
     if not clouds:
         raise InputError("imitate_batch(): there are no clouds; expected at least one")

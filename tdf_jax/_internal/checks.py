@@ -1,4 +1,11 @@
-"""Random keys, checked where a user gives one."""
+"""Validators of arguments, each with the one message that its kind of mistake gets.
+
+`function` begins the message: "solve()" in the library, "tdf imitate" on the command line. A validator returns the value, in
+the type that the caller wants. Shapes are checked of traced values too; what depends on numbers lets traced ones through,
+because they are not known yet.
+"""
+
+from collections.abc import Collection
 
 import jax
 import numpy as np
@@ -6,95 +13,167 @@ from numpy.typing import ArrayLike
 
 from tdf_jax._internal.errors import InputError
 
-
-def check_key(function: str, key) -> None:
-    """Raise InputError unless it is one random key, of `jax.random.key` or the older `jax.random.PRNGKey`."""
-    shape, dtype = getattr(key, "shape", None), getattr(key, "dtype", np.dtype(object))
-    if not (shape == () and jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key)) and not (
-        shape == (2,) and dtype == np.uint32
-    ):
-        got = repr(key) if shape is None or shape == () else f"an array of shape {shape}"
-        raise InputError(f"{function}: key is {got}; expected one random key, such as jax.random.key(0)")
-
-
 MINIMUM_POINTS = 21  # the encoder's 20 nearest neighbours, the point itself included, and one to choose from
 
 
-def check_points(points, name: str = "points"):
-    """Check that an array can be encoded as a point cloud; nothing is changed or dropped.
+def traced(*values) -> bool:
+    """Whether one of the values is traced, so that its numbers are not known yet."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
-    Under `jax.jit` only the shape is checked: the values are not known yet.
+
+def count(function: str, name: str, value, least: int = 1) -> int:
+    """A whole number of at least `least`."""
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
+        raise InputError(f"{function}: {name} is {value!r}; expected a whole number of at least {least}")
+    return int(value)
+
+
+def number(function: str, name: str, value, least: float = -np.inf, most: float = np.inf, unit: str = ""):
+    """One finite number between `least` and `most`, ends included."""
+    if traced(value):
+        return _scalar(function, name, value)
+    if not _is_number(value) or not least <= value <= most:
+        above = f" of {least:g} or more" if np.isfinite(least) else ""
+        expected = f" from {least:g} to {most:g}" if np.isfinite(most) else above
+        raise InputError(f"{function}: {name} is {value!r}; expected one finite number{expected}{unit and ', ' + unit}")
+    return value
+
+
+def positive(function: str, name: str, value, unit: str = ""):
+    """One finite number above 0."""
+    if traced(value):
+        return _scalar(function, name, value)
+    if not _is_number(value) or not value > 0:
+        raise InputError(f"{function}: {name} is {value!r}; expected a positive number{unit and ', ' + unit}")
+    return value
+
+
+def choice(function: str, name: str, value, choices: Collection[str]) -> str:
+    """One of the choices."""
+    if not isinstance(value, str) or value not in choices:
+        raise InputError(f"{function}: {name} is {value!r}; expected one of {', '.join(choices)}")
+    return value
+
+
+def vector(function: str, name: str, value: ArrayLike, size: int = 3, unit: str = "metres") -> np.ndarray | jax.Array:
+    """`size` finite numbers, as float64 unless they are traced."""
+    words = {3: "three", 4: "four", 7: "seven"}.get(size, str(size))
+    vector = value if traced(value) else _array(function, name, value)
+    if vector.shape != (size,) or not (traced(vector) or np.isfinite(vector).all()):
+        raise InputError(f"{function}: {name} is {value}; expected {words} finite numbers{unit and ', ' + unit}")
+    return vector
+
+
+def pose(function: str, name: str, value: ArrayLike) -> ArrayLike:
+    """One finite pose `wxyz_xyz` whose quaternion is not zero; returned as it is."""
+    if np.shape(value) != (7,):
+        raise InputError(f"{function}: {name} has shape {np.shape(value)}; expected one pose wxyz_xyz, (7,)")
+    if not traced(value):
+        values = _array(function, name, value)
+        if not np.isfinite(values).all() or not np.linalg.norm(values[:4]) > 1e-6:
+            raise InputError(
+                f"{function}: {name} is {values.tolist()}; expected one finite pose wxyz_xyz, its quaternion not zero"
+            )
+    return value
+
+
+def rotations(function: str, name: str, value: ArrayLike) -> ArrayLike:
+    """Rotation matrices (..., 3, 3); returned as they are."""
+    if np.shape(value)[-2:] != (3, 3):
+        raise InputError(f"{function}: {name} has shape {np.shape(value)}; expected rotation matrices, (..., 3, 3)")
+    if not traced(value):
+        R = _array(function, name, value)
+        if not (np.allclose(R @ np.swapaxes(R, -1, -2), np.eye(3), atol=1e-3) and (np.linalg.det(R) > 0).all()):
+            raise InputError(f"{function}: {name} is not orthonormal with determinant 1, or not finite")
+    return value
+
+
+def key(function: str, value) -> jax.Array:
+    """One random key, of `jax.random.key` or the older `jax.random.PRNGKey`."""
+    shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", np.dtype(object))
+    if not (shape == () and jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key)) and not (
+        shape == (2,) and dtype == np.uint32
+    ):
+        got = repr(value) if shape is None or shape == () else f"an array of shape {shape}"
+        raise InputError(f"{function}: key is {got}; expected one random key, such as jax.random.key(0)")
+    return value
+
+
+def points(function: str, value, name: str = "points"):
+    """A point cloud that can be encoded, (points, 3), metres; nothing is changed or dropped.
 
     Args:
-        points: Array (points, 3), numpy or jax, metres.
-        name: What the message calls it.
+        function: begins the message.
+        value: array, numpy or jax.
+        name: what the message calls it.
 
     Returns:
         The same array; a list as a numpy array, integers as float32.
 
     Raises:
-        InputError: If the shape is not (points, 3), there are fewer than 21, one is not finite, or all are equal.
+        InputError: the shape is not (points, 3), there are fewer than 21, one is not finite, or all are equal.
     """
-    if not isinstance(points, jax.Array):
+    if not isinstance(value, jax.Array):
         try:
-            points = np.asarray(points)
+            value = np.asarray(value)
         except ValueError as error:
-            raise InputError(f"check_points(): {name} is not an array of numbers: {error}") from error
-    if points.dtype.kind in "iu":
-        points = points.astype(np.float32)
-    if not jax.numpy.issubdtype(points.dtype, np.floating):
-        raise InputError(f"check_points(): {name} has dtype {points.dtype}; expected floating point metres.")
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"check_points(): {name} has shape {points.shape}; expected (points, 3).")
-    if len(points) < MINIMUM_POINTS:
+            raise InputError(f"{function}: {name} is not an array of numbers: {error}") from error
+    if value.dtype.kind in "iu":
+        value = value.astype(np.float32)
+    if not jax.numpy.issubdtype(value.dtype, np.floating):
+        raise InputError(f"{function}: {name} has dtype {value.dtype}; expected floating point metres")
+    if value.ndim != 2 or value.shape[1] != 3:
+        raise InputError(f"{function}: {name} has shape {value.shape}; expected (points, 3)")
+    if len(value) < MINIMUM_POINTS:
         raise InputError(
-            f"check_points(): {name} has {len(points)} points; expected at least {MINIMUM_POINTS} "
-            "(the encoder looks at 20 neighbours). Use a denser cloud."
+            f"{function}: {name} has {len(value)} points; expected at least {MINIMUM_POINTS} "
+            "(the encoder looks at 20 neighbours). Use a denser cloud"
         )
-    if isinstance(points, jax.core.Tracer):
-        return points
-    values = np.asarray(points)
+    if traced(value):
+        return value
+    values = np.asarray(value)
     bad = np.count_nonzero(~np.isfinite(values).all(axis=1))
     if bad:
         raise InputError(
-            f"check_points(): {bad} of the {len(values)} points of {name} are NaN or infinite; expected finite "
-            "metres. Remove them: points[np.isfinite(points).all(axis=1)]."
+            f"{function}: {bad} of the {len(values)} points of {name} are NaN or infinite; expected finite "
+            "metres. Remove them: points[np.isfinite(points).all(axis=1)]"
         )
     if not np.ptp(values, axis=0).any():
         raise InputError(
-            f"check_points(): the {len(values)} points of {name} are all equal to {values[0].tolist()}; "
-            "expected a surface."
+            f"{function}: the {len(values)} points of {name} are all equal to {values[0].tolist()}; expected a surface"
         )
-    return points
+    return value
 
 
-def check_count(function: str, poses: int) -> None:
-    """Raise InputError unless there can be so many poses."""
-    if not isinstance(poses, int | np.integer) or poses < 2:
-        raise InputError(f"{function}(): poses is {poses}; expected a whole number of at least 2, pick and place.")
-
-
-def check_rotations(function: str, R: ArrayLike) -> None:
-    """Raise InputError unless all are rotation matrices."""
-    R = np.asarray(R, dtype=np.float64)
-    if not (np.allclose(R @ np.swapaxes(R, -1, -2), np.eye(3), atol=1e-3) and (np.linalg.det(R) > 0).all()):
-        raise InputError(f"{function}(): a rotation matrix is not orthonormal with determinant 1, or not finite.")
-
-
-def checked_vector(function: str, name: str, value: ArrayLike) -> np.ndarray:
-    """Three finite numbers as float64, or InputError."""
-    vector = np.asarray(value, dtype=np.float64)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise InputError(f"{function}(): {name} is {value}; expected three finite numbers, metres.")
-    return vector
-
-
-def check_query(function: str, query) -> None:
-    """Raise InputError unless query points are (queries, 3), at least one, and finite."""
-    shape = np.shape(query)
+def query(function: str, value) -> ArrayLike:
+    """Query points (queries, 3), at least one, finite; returned as they are."""
+    shape = np.shape(value)
     if len(shape) != 2 or shape[1] != 3 or shape[0] < 1:
         raise InputError(
             f"{function}: query points have shape {shape}; expected (queries, 3). Try tdf.box_query(key, count=500)"
         )
-    if not isinstance(query, jax.core.Tracer) and not np.isfinite(np.asarray(query)).all():
+    if not traced(value) and not np.isfinite(np.asarray(value)).all():
         raise InputError(f"{function}: some query points are NaN or infinite; expected finite metres")
+    return value
+
+
+def _is_number(value) -> bool:
+    if isinstance(value, bool | np.bool_) or np.ndim(value) != 0:
+        return False
+    try:
+        return bool(np.isfinite(value))
+    except TypeError:
+        return False
+
+
+def _scalar(function, name, value):
+    if np.ndim(value) != 0:
+        raise InputError(f"{function}: {name} has shape {np.shape(value)}; expected one number")
+    return value
+
+
+def _array(function, name, value) -> np.ndarray:
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{function}: {name} is {value!r}; expected numbers") from None

@@ -11,7 +11,7 @@ from tqdm import tqdm
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
 from tdf_jax.networks.checkpoint import load_model
-from tdf_jax.paper import figures, table
+from tdf_jax.paper import energy_maps, figures, table
 from tdf_jax.paper.runs import Run
 from tdf_jax.paper.setting import Setting, scene
 from tdf_jax.paper.store import Store
@@ -38,7 +38,7 @@ def reproduce(
     weights: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "mug",
     setting: Annotated[Setting, tyro.conf.arg(name="")] = Setting(),
 ) -> None:
-    """Regenerate the paper's table and figures with mugs of the library's own; docs/paper.md explains every number.
+    """Regenerate the paper's table and figures with mugs of the library's own; docs/results/paper.md explains every number.
 
     Interrupted and run again, it does only what is missing.
 

@@ -3,7 +3,7 @@
 import jax
 from jaxtyping import Array, Float
 
-from tdf_jax._internal.checks import check_query
+from tdf_jax._internal import checks
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.networks.field import DescriptorField
@@ -22,7 +22,7 @@ def pose_descriptor(
     Raises:
         InputError: query points that are not (queries, 3) and finite.
     """
-    check_query("pose_descriptor()", query)
+    checks.query("pose_descriptor()", query)
     return field.descriptors(se3.transform(T_world_query, query))
 
 

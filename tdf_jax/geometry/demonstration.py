@@ -4,7 +4,7 @@ import dataclasses
 
 from jaxtyping import Array, Float
 
-from tdf_jax._internal.checks import check_points, check_query
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.trajectory import Trajectory, check_trajectory
 
@@ -27,10 +27,10 @@ class Demonstration:
     query: Float[Array, "queries 3"]
 
     def __post_init__(self):
-        check_points(self.points, "the demonstration's points")
+        checks.points("Demonstration()", self.points)
         if not isinstance(self.trajectory, Trajectory):
             raise InputError(
                 f"Demonstration(): trajectory is a {type(self.trajectory).__name__}; expected a Trajectory, such as tdf.wave()"
             )
         check_trajectory(self.trajectory)
-        check_query("Demonstration()", self.query)
+        checks.query("Demonstration()", self.query)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from tdf_jax._internal.checks import check_points, check_rotations, checked_vector
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.winding import libigl, winding_number
@@ -114,7 +114,7 @@ def box_obstacle(centre: ArrayLike, size: ArrayLike, rotation: ArrayLike | None 
     Raises:
         InputError: An argument has a wrong shape or value.
     """
-    centre, size = checked_vector("box_obstacle", "centre", centre), checked_vector("box_obstacle", "size", size)
+    centre, size = checks.vector("box_obstacle()", "centre", centre), checks.vector("box_obstacle()", "size", size)
     if not (size > 0).all():
         raise InputError(
             f"box_obstacle(): size is {size.tolist()}; expected three lengths above 0, metres; give a sheet its thickness"
@@ -127,7 +127,7 @@ def box_obstacle(centre: ArrayLike, size: ArrayLike, rotation: ArrayLike | None 
             )
         wxyz = R / np.linalg.norm(R)
     elif R.shape == (3, 3):
-        check_rotations("box_obstacle", R)
+        checks.rotations("box_obstacle()", "rotation", R)
         wxyz = se3.wxyz_from_matrix(jnp.asarray(R))
     else:
         raise InputError(f"box_obstacle(): rotation has shape {R.shape}; expected (3, 3), or (4,) as wxyz")
@@ -197,7 +197,7 @@ def cloud_obstacle(
     """
     from scipy.spatial import cKDTree
 
-    points = np.asarray(check_points(points), float)
+    points = np.asarray(checks.points("cloud_obstacle()", points), float)
     if not (np.ndim(radius) == 0 and 0 <= radius < np.inf):
         raise InputError(f"cloud_obstacle(): radius is {radius}; expected a length of 0 or more, metres")
     tree = cKDTree(points)

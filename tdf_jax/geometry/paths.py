@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from tdf_jax._internal.checks import check_count, check_rotations, checked_vector
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.trajectory import Trajectory, resample
@@ -206,7 +206,7 @@ def hang_on_rack(
             or all of the way.
     """
     start, end, R_start, R_end = _ends("hang_on_rack", start, end, rotation, end_rotation)
-    approach = checked_vector("hang_on_rack", "approach", approach)
+    approach = checks.vector("hang_on_rack()", "approach", approach)
     front = end - approach
     if not (approach.any() and np.linalg.norm(front - start) > 0):
         raise InputError(
@@ -224,12 +224,12 @@ PATHS = SHAPES | {"lift_over": lift_over, "tilt_and_pour": tilt_and_pour, "hang_
 
 def _through(function, poses, places, rotations) -> Trajectory:
     """Evenly spaced by length along the straight lines between key poses; turns are even on each."""
-    check_count(function, poses)
+    checks.count(f"{function}()", "num_poses", poses, least=2)
     return resample(Trajectory(se3.pose(jnp.stack(rotations), jnp.asarray(np.stack(places)))), poses)
 
 
 def _ends(function, start, end, rotation, end_rotation):
-    start, end = checked_vector(function, "start", start), checked_vector(function, "end", end)
+    start, end = checks.vector(f"{function}()", "start", start), checks.vector(f"{function}()", "end", end)
     if not np.linalg.norm(end - start) > 0:
         raise InputError(f"{function}(): start and end are both {start.tolist()}; expected two places.")
     R_start = _rotation(function, np.eye(3) if rotation is None else rotation)
@@ -243,7 +243,7 @@ def _positive(function, name, value, expected="one number above 0.") -> float:
 
 
 def _direction(function, name, value) -> np.ndarray:
-    direction = checked_vector(function, name, value)
+    direction = checks.vector(f"{function}()", name, value)
     if not direction.any():
         raise InputError(f"{function}(): {name} is zero; expected a direction.")
     return direction / np.linalg.norm(direction)
@@ -257,20 +257,20 @@ def _rotation(function: str, rotation: ArrayLike) -> Float[Array, "3 3"]:
         return se3.matrix_from_wxyz(jnp.asarray(rotation))
     if rotation.shape != (3, 3):
         raise InputError(f"{function}(): rotation has shape {rotation.shape}; expected (3, 3), or (4,) as wxyz.")
-    check_rotations(function, rotation)
+    checks.rotations(f"{function}()", "rotation", rotation)
     return jnp.asarray(rotation)
 
 
 def _trajectory(function, poses, start, end, rotation, end_rotation, curve, height=None, bulge=None) -> Trajectory:
     """Poses along `curve`: fractions in [0, 1] and the chord's length -> distances along the chord and across it."""
-    check_count(function, poses)
+    checks.count(f"{function}()", "num_poses", poses, least=2)
     start, end, R_start, R_end = _ends(function, start, end, rotation, end_rotation)
     chord = np.linalg.norm(end - start)
     if height is not None:
         _positive(function, "height", height, "metres above 0. Turn bulge for the other side.")
     forward, side = (end - start) / chord, np.zeros(3)
     if bulge is not None:
-        bulge = checked_vector(function, "bulge", bulge)
+        bulge = checks.vector(f"{function}()", "bulge", bulge)
         side = bulge - forward * (forward @ bulge)
         if not np.linalg.norm(side) > 1e-6 * np.linalg.norm(bulge):
             raise InputError(f"{function}(): bulge {bulge.tolist()} is zero or along the chord; expected a way aside.")

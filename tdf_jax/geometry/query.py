@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from tdf_jax._internal.checks import check_key
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 
 
@@ -34,7 +34,7 @@ def box_query(
     Raises:
         InputError: If count is below 1, an edge is not above 0, or a shape is wrong.
     """
-    check_key("box_query()", key)
+    checks.key("box_query()", key)
     _check_count("box_query", count)
     size = _lengths("box_query", "size", [size] * 3 if np.ndim(size) == 0 else size, 3)
     return _centre("box_query", centre) + size * jax.random.uniform(key, (count, 3), minval=-0.5, maxval=0.5)
@@ -57,7 +57,7 @@ def gaussian_query(
     Raises:
         InputError: If count is below 1, sigma is not above 0, or a shape is wrong.
     """
-    check_key("gaussian_query()", key)
+    checks.key("gaussian_query()", key)
     _check_count("gaussian_query", count)
     sigma = _lengths("gaussian_query", "sigma", sigma)
     return _centre("gaussian_query", centre) + sigma * jax.random.normal(key, (count, 3))
@@ -89,7 +89,7 @@ def gripper_query(
     Raises:
         InputError: If count is below 1, a length is not above 0, or a shape is wrong.
     """
-    check_key("gripper_query()", key)
+    checks.key("gripper_query()", key)
     _check_count("gripper_query", count)
     opening, palm = _lengths("gripper_query", "opening", opening), _lengths("gripper_query", "palm", palm)
     width, thickness, length = _lengths("gripper_query", "finger", finger, 3)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tdf_jax._internal.checks import check_count, check_rotations, checked_vector
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
 
@@ -68,7 +68,7 @@ class Trajectory:
         if not isinstance(T, jax.core.Tracer):
             if not np.isfinite(T).all():
                 raise InputError("Trajectory.from_matrices(): a matrix is NaN or infinite; expected rigid transforms.")
-            check_rotations("Trajectory.from_matrices", T[:, :3, :3])
+            checks.rotations("Trajectory.from_matrices()", "T_world_query", T[:, :3, :3])
             if not np.allclose(T[:, 3], [0, 0, 0, 1], atol=1e-6):
                 raise InputError("Trajectory.from_matrices(): the last row of a matrix is not 0 0 0 1, as expected.")
         return check_trajectory(cls(se3.pose(T[:, :3, :3], T[:, :3, 3])))
@@ -148,7 +148,7 @@ def resample(trajectory: Trajectory, poses: int) -> Trajectory:
     Raises:
         InputError: If poses is below 2, the trajectory has one pose, or it fails `check_trajectory`.
     """
-    check_count("resample", poses)
+    checks.count("resample()", "num_poses", poses, least=2)
     if check_trajectory(trajectory).poses < 2:
         raise InputError("resample(): the trajectory has one pose; expected at least 2, a way between.")
     R, t = trajectory.rotations, trajectory.translations
@@ -178,7 +178,6 @@ def displace(trajectory: Trajectory, offset: Float[Array, "3"], where: Literal["
     """
     if where not in ("start", "goal"):
         raise InputError(f"displace(): where is {where!r}; expected 'start' or 'goal'.")
-    if not isinstance(offset, jax.core.Tracer):
-        offset = checked_vector("displace", "offset", offset)
+    offset = checks.vector("displace()", "offset", offset)
     wxyz_xyz = jnp.asarray(check_trajectory(trajectory).wxyz_xyz)
     return Trajectory(wxyz_xyz.at[0 if where == "start" else -1, 4:].add(jnp.asarray(offset, wxyz_xyz.dtype)))

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from tdf_jax._internal.checks import check_points
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.io.meshes import MESH_SUFFIXES, existing_file, mesh_in, read_scene, unreadable
@@ -31,7 +31,7 @@ def load_points(
         Points, metres, float32.
 
     Raises:
-        InputError: If the file is missing, unreadable or of another kind, or its points fail `check_points`.
+        InputError: If the file is missing, unreadable or of another kind, or its points are no cloud.
     """
     path = existing_file("load_points", path, tuple(dict.fromkeys(MESH_SUFFIXES + _CLOUD_SUFFIXES)), scale)
     if count is not None and count < 1:
@@ -42,17 +42,17 @@ def load_points(
         mesh = mesh_in("load_points", path, scene, scale)
         if mesh is not None:
             points = sample_surface(mesh, 1500 if count is None else count, rng)
-            return check_points(points.astype(np.float32), str(path))
+            return checks.points("load_points()", points.astype(np.float32), str(path))
         if path.suffix.lower() not in _CLOUD_SUFFIXES:
             raise InputError(f"load_points(): {path} is a mesh without faces; expected a surface, or a cloud as .ply.")
         parts = [np.asarray(part.vertices) for part in scene.geometry.values()]
         points = np.concatenate(parts) if parts else np.zeros((0, 3))
     else:
         points = _read_array(path)
-    points = check_points(points, str(path)) * scale
+    points = checks.points("load_points()", points, str(path)) * scale
     if count is not None and count < len(points):
         points = points[np.sort(rng.choice(len(points), count, replace=False))]
-    return check_points(points.astype(np.float32), str(path))
+    return checks.points("load_points()", points.astype(np.float32), str(path))
 
 
 def _read_array(path: Path) -> np.ndarray:

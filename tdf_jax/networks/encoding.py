@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from tdf_jax._internal.checks import check_points
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.precision import full_precision
 from tdf_jax.geometry import sampling
@@ -45,7 +45,7 @@ def encode(model: Model, points: Float[Array, "points 3"], thinnings: int = THIN
         InputError: the points are fewer than 21 or than the network's neighbours, not (points, 3), not finite or all
             equal; thinnings is negative, or the points would be thinned under `jax.jit`.
     """
-    points, count = check_points(points), model.info.cloud_points
+    points, count = checks.points("encode()", points), model.info.cloud_points
     if not isinstance(thinnings, int | np.integer) or thinnings < 0:
         raise InputError(f"encode(): thinnings is {thinnings}; expected a whole number of 0 or more")
     if len(points) < model.config.neighbours:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tdf_jax._internal.checks import check_points
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.networks.field import DescriptorField
 from tdf_jax.networks.model import Model
@@ -26,7 +26,7 @@ def refine(model: Model, field: DescriptorField, points: Float[Array, "points 3"
     The encoder sees a few hundred of an object's points at a time and knows its surface from them to a few millimetres.
     The mean of (occupancy - 1/2)^2 over up to 1500 points, lowered by gradient steps on the latent with the network as
     it is, adds what the others say. It is for shapes: reconstruction, clearance. Poses found with a refined field are
-    hardly other ones (docs/evaluation.md). It has no reverse-mode derivative.
+    hardly other ones (docs/results/evaluation.md). It has no reverse-mode derivative.
 
     Args:
         model: the network that encoded the field.
@@ -46,7 +46,7 @@ def refine(model: Model, field: DescriptorField, points: Float[Array, "points 3"
         Steps are VectorAdam's, of one length for the three numbers of a vector, so that they turn with the cloud: Ling,
         Sharp and Jacobson, NeurIPS 2022. Fitting a latent to observations is as in DeepSDF: Park et al., CVPR 2019.
     """
-    points = check_points(points)
+    points = checks.points("refine()", points)
     if isinstance(points, jax.core.Tracer):
         raise InputError(
             "refine(): the points are traced by jax.jit; expected an array. Call refine() outside: it is compiled already"

@@ -1,20 +1,14 @@
 """An obstacle from a field: the object as its network knows it."""
 
-from typing import TYPE_CHECKING
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tdf_jax._internal.checks import check_points
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.distance_fields import DistanceGrid, check_lengths, grid_nodes, tabulated
 from tdf_jax.networks.field import DescriptorField
-
-if TYPE_CHECKING:
-    pass
-
 
 FIELD_BLOCK = 8192  # points of a field evaluated in one call: one size, so that objects of all sizes run one program
 
@@ -31,7 +25,7 @@ def field_obstacle(
     """The object itself to keep clear of, as its field knows it: the surface is where the occupancy is a half.
 
     The field tells hidden sides too, which the cloud does not. Refine it first (`refine`): this is what that is for.
-    How far from true the distances are, docs/clearance.md tells.
+    How far from true the distances are, docs/results/clearance.md tells.
 
     Args:
         field: The object's.
@@ -50,7 +44,7 @@ def field_obstacle(
     from scipy.ndimage import label
     from scipy.spatial import cKDTree
 
-    points = np.asarray(check_points(points), float)
+    points = np.asarray(checks.points("field_obstacle()", points), float)
     check_lengths("field_obstacle", pitch, pad)
     x = grid_nodes("field_obstacle", points, pitch, FIELD_REACH + pitch)
     flat = np.asarray(x.reshape(-1, 3), field.origin.dtype)

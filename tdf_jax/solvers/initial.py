@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from tdf_jax._internal import devices
-from tdf_jax._internal.checks import check_key
+from tdf_jax._internal import checks, devices
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference
@@ -54,7 +53,7 @@ def prepare(
             "expected both from the same model"
         )
     if starts is None:
-        check_key(function, key)
+        checks.key(function, key)
         goal = default_goal(field, reference) if goal is None and fix_last else goal
         starts = random_starts(key, field, reference, config.inits, config.start, config.start_radius)
     if goal is not None:

@@ -25,8 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from tdf_jax._internal import devices
-from tdf_jax._internal.checks import check_key
+from tdf_jax._internal import checks, devices
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference
@@ -133,7 +132,7 @@ def solve(
             query points of the stage and without a fixed last pose (of the first two, those of the keyframe); may raise
             to cancel.
         mesh: devices to share the candidates, of this process or of several that make the same call; see
-            docs/scaling.md.
+            docs/guide/scaling.md.
 
     Returns:
         A result whose rows are trajectories of the best, second best, ... candidates of each waypoint. Its `losses` are
@@ -143,7 +142,7 @@ def solve(
     Raises:
         InputError: as for `optimize`, or a weight on eq. 6, which couples the waypoints.
     """
-    check_key("solve()", key)
+    checks.key("solve()", key)
     most = dataclasses.replace(config, inits=max(config.inits, config.scouts))
     given = starts is not None
     starts, energy = prepare("solve()", field, reference, key, goal, fix_last, energy, most, starts, mesh)

@@ -3,7 +3,7 @@
 Eq. 3 of the paper holds every waypoint near the demonstration's pose in the world, and its descriptors pull every
 waypoint along with the object: where object and goal moved differently the two disagree, waypoint by waypoint. Here
 descriptors find one motion, that of the pick, and the goal gives the other; each waypoint is carried by what lies
-between them (docs/benchmark.md compares).
+between them (docs/results/benchmark.md compares).
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from tdf_jax._internal.checks import check_key
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference
@@ -101,7 +101,7 @@ def carry(
     Raises:
         InputError: as for `solve`, or a goal that fix_last=False would not keep.
     """
-    check_key("carry()", key)
+    checks.key("carry()", key)
     if not isinstance(config, CarryConfig):
         raise InputError(f"carry(): config is {config!r}; expected a CarryConfig")
     if fix_last and reference.trajectory.poses == 1:

@@ -5,19 +5,19 @@ import numpy as np
 import pytest
 
 import tdf_jax as tdf
-from tdf_jax._internal.checks import check_key
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 
 
 @pytest.mark.parametrize("key", [jax.random.key(0), jax.random.PRNGKey(0)])
 def test_keys_of_both_kinds_pass(key):
-    check_key("f()", key)
+    checks.key("f()", key)
 
 
 @pytest.mark.parametrize("key", [0, None, 1.5, np.zeros(2), np.uint32(3), jax.random.split(jax.random.key(0))])
 def test_anything_else_is_told_how_to_make_one(key):
     with pytest.raises(InputError, match=r"f\(\): key is .*; expected one random key, such as jax.random.key\(0\)"):
-        check_key("f()", key)
+        checks.key("f()", key)
 
 
 def test_functions_that_draw_check_their_key(small_model, demonstration, field, reference):

@@ -13,6 +13,7 @@ from conftest import SMALL, random_cloud, random_poses
 import tdf_jax as tdf
 from tdf_jax._internal.precision import full_precision
 from tdf_jax.geometry import se3
+from tdf_jax.solvers import gauss_newton
 from tdf_jax.training.objective import mean_gradient
 
 EXACT, FAST = jax.lax.Precision.HIGHEST, jax.lax.Precision.DEFAULT

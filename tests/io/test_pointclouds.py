@@ -1,5 +1,6 @@
 """Clouds, and the meshes they are sampled from: files of every kind and their damage, thinning."""
 
+import functools
 import subprocess
 import sys
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from tdf_jax._internal.checks import check_points
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.sampling import thin, thin_indices
 from tdf_jax.io.meshes import load_mesh
@@ -216,15 +217,15 @@ def test_bad_counts_and_points_of_files(tmp_path):
 @pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
 def test_check_points_returns_good_points_as_they_are(array):
     points = array(CLOUD)
-    assert check_points(points) is points
-    assert check_points(points[:21]).shape == (21, 3)
+    assert checks.points("encode()", points) is points
+    assert checks.points("encode()", points[:21]).shape == (21, 3)
 
 
 def test_check_points_of_lists_and_integers():
-    points = check_points(CLOUD.tolist())
+    points = checks.points("encode()", CLOUD.tolist())
     assert isinstance(points, np.ndarray)
     np.testing.assert_array_equal(points, CLOUD)
-    assert check_points(np.arange(63).reshape(21, 3)).dtype == np.float32
+    assert checks.points("encode()", np.arange(63).reshape(21, 3)).dtype == np.float32
 
 
 def replaced(value):
@@ -252,15 +253,15 @@ BAD_POINTS = {
 @pytest.mark.parametrize("message", BAD_POINTS)
 def test_check_points_says_what_is_wrong(message):
     with pytest.raises(InputError, match=message):
-        check_points(BAD_POINTS[message], "cloud")
+        checks.points("encode()", BAD_POINTS[message], "cloud")
 
 
 def test_check_points_inside_jit_checks_the_shape():
-    np.testing.assert_array_equal(jax.jit(check_points)(CLOUD), CLOUD)
+    np.testing.assert_array_equal(jax.jit(functools.partial(checks.points, "encode()"))(CLOUD), CLOUD)
     with jax.debug_nans(False):
-        assert np.isnan(jax.jit(check_points)(replaced(np.nan))).sum() == 2
+        assert np.isnan(jax.jit(functools.partial(checks.points, "encode()"))(replaced(np.nan))).sum() == 2
     with pytest.raises(InputError, match="has 20 points"):
-        jax.jit(check_points)(CLOUD[:20])
+        jax.jit(functools.partial(checks.points, "encode()"))(CLOUD[:20])
 
 
 def test_thinning_by_hand():
