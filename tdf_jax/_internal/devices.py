@@ -1,4 +1,7 @@
-"""Work shared among the devices of a mesh, in one process or several: each takes a part of the starts or of a grid, and only results are exchanged."""
+"""Work shared among the devices of a mesh, in one process or in several.
+
+Each device takes a part of the starts or of a grid, and the processes exchange nothing but results.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -8,67 +11,83 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from tdf_jax._internal.errors import InputError
 
-WHOLE = PartitionSpec()
-# Descriptors held at a time on an accelerator: 134 MB, and as much again for every tangent. An estimate: enough to fill
-# it, few enough for its memory.
+REPLICATED = PartitionSpec()
+# An accelerator holds 134 MB of descriptors at a time, and as much again for every tangent. The number is an estimate:
+# it fills an accelerator and fits into its memory.
 ACCELERATOR_POINTS = 16384
 
-ONCE = {"xla_backend_optimization_level": 0}  # for programs that run once a call: half the time to compile
+# Programs that run once a call compile in half of the time.
+FAST_COMPILATION = {"xla_backend_optimization_level": 0}
 
 
 def one_at_a_time() -> bool:
-    """Whether equal work is faster one piece after the other: on a CPU, whose cache then holds it; an accelerator wants all of it together."""
+    """Whether equal pieces of work run faster one after the other than together.
+
+    They do on a CPU, whose cache then holds one piece. An accelerator needs all of them together.
+    """
     return jax.default_backend() == "cpu"
 
 
 def points_at_a_time(cpu_points: int) -> int:
-    """How many query points to evaluate at a time: a CPU wants them in its cache, an accelerator wants many."""
+    """How many query points to evaluate at a time.
+
+    Args:
+        cpu_points: number that fits the cache of a CPU.
+
+    Returns:
+        That number on a CPU; `ACCELERATOR_POINTS` on an accelerator.
+    """
     return cpu_points if one_at_a_time() else ACCELERATOR_POINTS
 
 
-def check_mesh(function: str, mesh) -> None:
-    """Raise InputError unless it is a mesh, or None."""
-    if mesh is not None and not isinstance(mesh, Mesh):
+def check_device_mesh(function: str, device_mesh) -> None:
+    """Raise InputError unless the argument `device_mesh` is a mesh or None."""
+    if device_mesh is not None and not isinstance(device_mesh, Mesh):
         raise InputError(
-            f"{function}: mesh is {mesh!r}; expected a jax.sharding.Mesh, such as jax.make_mesh((2,), ('devices',))"
+            f"{function}: device_mesh is {device_mesh!r}; expected a jax.sharding.Mesh, such as "
+            "jax.make_mesh((2,), ('devices',))"
         )
 
 
-def alone() -> Mesh:
-    """Jax's default device of this process as a mesh."""
-    return Mesh(np.array(list(jnp.zeros(()).devices())), ("alone",))
+def default_device_mesh() -> Mesh:
+    """Mesh of JAX's default device of this process."""
+    return Mesh(np.array(list(jnp.zeros(()).devices())), ("default",))
 
 
-def split(mesh: Mesh) -> PartitionSpec:
-    """The first axis in as many parts as the mesh has devices, whatever its shape."""
-    return PartitionSpec(mesh.axis_names)
+def sharded(device_mesh: Mesh) -> PartitionSpec:
+    """Specification that splits the first axis into as many parts as the mesh has devices, whatever its shape."""
+    return PartitionSpec(device_mesh.axis_names)
 
 
-def placed(tree, mesh: Mesh, spec: PartitionSpec = WHOLE):
-    """Arrays on the devices of a mesh, whole on each by default.
+def placed(tree, device_mesh: Mesh, spec: PartitionSpec = REPLICATED):
+    """Arrays placed on the devices of a mesh.
 
     Args:
-        tree: the same in all processes; to be split, lengths are multiples of the number of devices.
-        mesh: of devices, of which other processes may hold some.
-        spec: `WHOLE` or `split(mesh)`.
+        tree: arrays that are the same in all processes; with `sharded`, their lengths are multiples of the number of
+            devices.
+        device_mesh: devices, some of which other processes may hold.
+        spec: `REPLICATED` or `sharded(device_mesh)`.
+
+    Returns:
+        The tree, its leaves as global arrays.
     """
 
     def place(leaf):
-        # Not `device_put`, which refuses arrays that are on devices of this process for a mesh of several processes.
+        # `device_put` refuses arrays on devices of this process for a mesh of several processes.
         leaf = np.asarray(leaf)
-        return jax.make_array_from_callback(leaf.shape, NamedSharding(mesh, spec), lambda index: leaf[index])
+        return jax.make_array_from_callback(leaf.shape, NamedSharding(device_mesh, spec), lambda index: leaf[index])
 
     return jax.tree.map(place, tree)
 
 
 def gathered(array: jax.Array) -> np.ndarray:
-    """All of an array, in every process that takes part."""
+    """The whole array, in every process that takes part."""
     if array.is_fully_addressable:
         return np.asarray(array)
-    return multihost_utils.process_allgather(array, tiled=True)
+    return np.asarray(multihost_utils.process_allgather(array, tiled=True))
 
 
-def padded(array: np.ndarray, mesh: Mesh) -> np.ndarray:
-    """An array repeated from its beginning up to a multiple of the number of devices."""
+def padded(array: np.ndarray, device_mesh: Mesh) -> np.ndarray:
+    """The array, repeated from its beginning up to a multiple of the number of devices."""
     array = np.asarray(array)
-    return np.resize(array, (-(-len(array) // mesh.size) * mesh.size, *array.shape[1:]))
+    return np.resize(array, (-(-len(array) // device_mesh.size) * device_mesh.size, *array.shape[1:]))

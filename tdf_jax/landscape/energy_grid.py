@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tdf_jax._internal.devices import check_mesh
+from tdf_jax._internal.devices import check_device_mesh
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.reference import Reference
 from tdf_jax.geometry import se3
@@ -125,7 +125,7 @@ def fill(
     Yields:
         The number of parts done and of all: tiles of the grid, one rotation after the other.
     """
-    check_mesh("energy_landscape()", mesh)
+    check_device_mesh("energy_landscape()", mesh)
     grid, query = landscape.grid, np.asarray(reference.query, dtype=float)
     found = [shared_lattice.layers(grid, query @ R.T, share) for R in landscape.rotations]
     cover = [shared_lattice.tiles(grid, each.span) for each in found]

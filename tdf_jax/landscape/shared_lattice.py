@@ -174,8 +174,8 @@ def swept(
     references = np.ascontiguousarray(padded.reshape(len(padded), blocks, UNROLLED, -1).swapaxes(0, 1))
     axes = grid.steps[:, None] * grid.directions
     shared = field, references, axes.astype(dtype), found.shifts.astype(np.int32), found.first.astype(np.int32)
-    mesh = devices.alone() if mesh is None else mesh
-    everywhere = NamedSharding(mesh, devices.split(mesh))
+    mesh = devices.default_device_mesh() if mesh is None else mesh
+    everywhere = NamedSharding(mesh, devices.sharded(mesh))
     workers = list(mesh.devices.flat)
     own = [
         (index, jax.device_put(shared, worker))

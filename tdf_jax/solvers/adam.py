@@ -116,7 +116,7 @@ def optimize(
     program = functools.partial(_run, fix_last=fix_last, chunk=count, mesh=mesh)
     rates = np.array([config.rotation_rate, config.translation_rate, config.final_rate, config.iterations], dtype)
     if mesh is not None:
-        starts = devices.placed(devices.padded(starts, mesh), mesh, devices.split(mesh))
+        starts = devices.placed(devices.padded(starts, mesh), mesh, devices.sharded(mesh))
         field, reference, energy, rates = devices.placed((field, reference, energy, rates), mesh)
     state = _begin(starts, reference.query)
     losses = []
@@ -152,7 +152,7 @@ def _poses(variables, start_rotations, query):
 def _run(state, starts, field, reference, energy, rates, steps, *, fix_last, chunk, mesh=None):
     work = functools.partial(_steps, fix_last=fix_last, chunk=chunk)
     if mesh is not None:
-        split, whole = devices.split(mesh), devices.WHOLE
+        split, whole = devices.sharded(mesh), devices.REPLICATED
         states = split, optax.ScaleByAdamState(whole, split, split), whole
         work = jax.shard_map(
             work, mesh=mesh, in_specs=(states, split, *[whole] * 5), out_specs=(states, split), check_vma=False

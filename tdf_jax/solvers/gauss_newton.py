@@ -43,7 +43,7 @@ class Problem(NamedTuple):
     centre: Float[Array, "3"]
 
 
-@functools.partial(jax.jit, compiler_options=devices.ONCE)
+@functools.partial(jax.jit, compiler_options=devices.FAST_COMPILATION)
 def in_blocks(reference: Reference, order: Int[Array, "blocks size"], counts: Bool[Array, "blocks size"]) -> Problem:
     """A reference's query points in blocks.
 
@@ -98,9 +98,9 @@ def descend(R, place, waypoint, bounds, damping, tolerance, field, problem, ener
     """
     work = functools.partial(_steps, length=length, chunk=chunk, axes=mesh.axis_names if mesh is not None else ())
     if mesh is not None:
-        split = devices.split(mesh)
+        split = devices.sharded(mesh)
         work = jax.shard_map(
-            work, mesh=mesh, in_specs=(*[split] * 3, *[devices.WHOLE] * 6), out_specs=split, check_vma=False
+            work, mesh=mesh, in_specs=(*[split] * 3, *[devices.REPLICATED] * 6), out_specs=split, check_vma=False
         )
     return work(R, place, waypoint, bounds, damping, tolerance, field, problem, energy)
 

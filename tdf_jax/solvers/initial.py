@@ -43,8 +43,8 @@ def prepare(
         raise InputError(
             f"{function}: energy is {energy!r}; expected EnergyWeights, such as EnergyWeights(correlation=0.02)"
         )
-    devices.check_mesh(function, mesh)
-    if fix_last and reference.trajectory.poses == 1:
+    devices.check_device_mesh(function, mesh)
+    if fix_last and reference.trajectory.num_poses == 1:
         raise InputError(f"{function}: the trajectory has one pose and fix_last keeps it; expected fix_last=False")
     channels = field.conditioned.config.channels
     if reference.descriptors.shape[-1] != channels:
@@ -59,9 +59,9 @@ def prepare(
     if goal is not None:
         check_goal(function, goal)
     starts = np.asarray(starts)
-    if starts.ndim != 3 or starts.shape[1:] != (reference.trajectory.poses, 7):
+    if starts.ndim != 3 or starts.shape[1:] != (reference.trajectory.num_poses, 7):
         raise InputError(
-            f"{function}: starts have shape {starts.shape}; expected (inits, {reference.trajectory.poses}, 7), "
+            f"{function}: starts have shape {starts.shape}; expected (inits, {reference.trajectory.num_poses}, 7), "
             "as many poses as the demonstration has"
         )
     # One type of every traced number: mixed ones promote, and a weight of 0 for 0.02 would compile again.
@@ -106,13 +106,13 @@ def random_starts(
     return _random_starts(key, field.origin, reference, radius, inits=inits, start=start)
 
 
-@functools.partial(jax.jit, static_argnames=("inits", "start"), compiler_options=devices.ONCE)
+@functools.partial(jax.jit, static_argnames=("inits", "start"), compiler_options=devices.FAST_COMPILATION)
 def _random_starts(key, origin, reference, radius, *, inits, start):
     return jax.vmap(lambda m: _start(jax.random.fold_in(key, m), origin, reference, start, radius))(jnp.arange(inits))
 
 
 def _start(key, origin, reference, start, radius):
-    n, dtype = reference.trajectory.poses, reference.trajectory.wxyz_xyz.dtype
+    n, dtype = reference.trajectory.num_poses, reference.trajectory.wxyz_xyz.dtype
     turn_key, way_key, far_key = jax.random.split(key, 3)
     if start == "carried":
         turn = se3.uniform_rotations(turn_key, 1)[0].astype(dtype)

@@ -290,7 +290,7 @@ def _run(stage, candidates, fixed=None, waypoints=None, *, shared, config, room,
     if mesh is not None:
         # Dealt out in turns, so that every device has its share of those that move.
         dealt = np.arange(room).reshape(-1, mesh.size).T.ravel()
-        given = devices.placed([part[dealt] for part in given], mesh, devices.split(mesh))
+        given = devices.placed([part[dealt] for part in given], mesh, devices.sharded(mesh))
         limits = devices.placed(limits, mesh)
     chunk = config.chunk or devices.points_at_a_time(CHUNK_POINTS)
     results = gauss_newton.descend(*given, *limits, *shared, length=max(config.steps) + 1, chunk=chunk, mesh=mesh)

@@ -96,6 +96,7 @@ def test_the_best_of_several_rotations_is_kept_for_each_point_and_waypoint(field
         np.testing.assert_allclose(found, best.values[waypoint].min(), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_points_that_do_not_count_are_nan(field, reference, small_tiles):
     grid = path_grid(np.asarray(field.origin) + np.array([[0.0, 0, 0], [0.1, 0.1, 0]]), 0.03, 0.015)
     landscape = energy_landscape(field, reference, grid)
@@ -159,6 +160,7 @@ def test_another_grid_of_one_size_compiles_nothing(field, reference):
     assert names == []
 
 
+@pytest.mark.slow
 def test_the_change_of_a_query_set_is_told(small_model, demonstration, field, reference):
     grid = volume_grid(0.2, 5, np.asarray(field.origin))
     assert query_change(field, reference, reference, grid) == (0.0, 0.0)
@@ -183,7 +185,7 @@ def test_what_does_not_fit_is_refused(field, reference):
     for matrix in (2 * np.eye(3), np.diag([1.0, 1.0, -1.0])):
         with pytest.raises(InputError, match="no rotations"):
             energy_landscape(field, reference, grid, matrix)
-    with pytest.raises(InputError, match=r"energy_landscape\(\): mesh is .*expected a jax.sharding.Mesh"):
+    with pytest.raises(InputError, match=r"energy_landscape\(\): device_mesh is .*expected a jax.sharding.Mesh"):
         energy_landscape(field, reference, grid, mesh=jax.devices())
     with pytest.raises(InputError, match="over_rotations is 'all'"):
         energy_landscape(field, reference, grid, over_rotations="all")
