@@ -1,15 +1,24 @@
-# make demo: install and imitate a trajectory on a new mug. make test: install and run the tests. make bench: measure against PyTorch.
+# make demo: install and imitate a trajectory on a new mug. make test: install and run the fast tests, in a few minutes.
+# make test-all: every test. make check: format, lint and types. make bench: measure against PyTorch.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test bench clean
+.PHONY: demo test test-all check bench clean
 
 demo: $(VENV)/.installed
 	$(BIN)/tdf imitate --out imitation
 
-test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest
+test: $(VENV)/.installed-test
+	$(BIN)/python -m pytest -m "not slow"
+
+test-all: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -rs
+
+check: $(VENV)/.installed-check
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/pyright
 
 bench: $(VENV)/.installed-bench
 	$(BIN)/python -m bench --out runs/bench
@@ -22,12 +31,9 @@ $(VENV)/.installed: $(VENV)/.venv pyproject.toml
 	$(BIN)/pip install --quiet --editable .
 	touch $@
 
-$(VENV)/.installed-dev: $(VENV)/.venv pyproject.toml
-	$(BIN)/pip install --quiet --editable '.[dev]'
-	touch $(VENV)/.installed $@
-
-$(VENV)/.installed-bench: $(VENV)/.venv pyproject.toml
-	$(BIN)/pip install --quiet --editable '.[bench]'
+# .installed-NAME: with the extra NAME
+$(VENV)/.installed-%: $(VENV)/.venv pyproject.toml
+	$(BIN)/pip install --quiet --editable '.[$*]'
 	touch $(VENV)/.installed $@
 
 clean:

@@ -1,9 +1,20 @@
 """What the tests share: golden outputs of the original network, a small random network, and a count of compilations."""
 
+import atexit
 import contextlib
 import dataclasses
 import os
+import shutil
+import tempfile
 from pathlib import Path
+
+# One compilation cache for all workers of a run and the commands that they start, and never the user's: most compile
+# the same small programs. The first process to come here makes it, and its workers inherit the name.
+if not {"PYTEST_XDIST_WORKER", "PYTEST_CURRENT_TEST"} & set(os.environ):
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _CACHE = tempfile.mkdtemp(prefix="tdf-compiled-")
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+    os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "0"
+    atexit.register(shutil.rmtree, _CACHE, ignore_errors=True)
 
 import jax
 import jax.numpy as jnp
@@ -31,11 +42,14 @@ def quick_compilation():
     """For tests of tiny programs that are slow to compile."""
 
 
-GOLDEN = {32: Path(__file__).parent / "fixtures"}
-# The golden outputs of the full-size network are too large to keep here; name their folder to test those as well.
-if "TDF_GOLDEN_DIR" in os.environ:
-    GOLDEN[256] = Path(os.environ["TDF_GOLDEN_DIR"])
+def pytest_collection_modifyitems(items):
+    """The original network in float64 is slow, as the full-size network is, see `golden`."""
+    for item in items:
+        if "golden" in item.fixturenames and "float64" in item.callspec.params.values():
+            item.add_marker(pytest.mark.slow)
 
+
+FIXTURES = Path(__file__).parent / "fixtures"
 TOLERANCE = {"float32": 5e-5, "float64": 1e-10}
 SMALL = tdf.NetworkConfig(latent=4, vector_hidden=6, vector_width=12, decoder_width=8, blocks=2)
 
@@ -88,9 +102,11 @@ class Golden:
     arrays: dict
 
 
-@pytest.fixture(scope="session", params=GOLDEN, ids=lambda size: f"latent{size}")
+@pytest.fixture(
+    scope="session", params=[32, pytest.param(256, marks=pytest.mark.slow)], ids=lambda size: f"latent{size}"
+)
 def golden(request):
-    path = GOLDEN[request.param] / f"ndf_latent{request.param}"
+    path = FIXTURES / f"ndf_latent{request.param}"
     with np.load(path.with_suffix(".npz")) as arrays:
         return Golden(tdf.convert_checkpoint(path.with_suffix(".pth")), dict(arrays))
 

@@ -36,7 +36,7 @@ def result(imitate, demonstration):
 
 def test_it_is_describe_encode_optimize(result, field, reference):
     assert_equal(result, tdf.optimize(field, reference, KEY, config=CONFIG))
-    assert isinstance(result.trajectory, tdf.Trajectory) and result.trajectory.poses == 4
+    assert isinstance(result.trajectory, tdf.Trajectory) and result.trajectory.num_poses == 4
     assert result.losses.shape == (3, 5)
 
 
@@ -116,7 +116,7 @@ def test_progress_is_passed_on(imitate, reference):
         ({"config": 100}, "config is 100; expected a CarryConfig, SolveConfig or OptimizeConfig"),
         ({"energy": 0.02}, "energy is 0.02; expected EnergyWeights"),
         ({"energy": 0.02, "config": tdf.SolveConfig()}, r"solve\(\): energy is 0.02; expected EnergyWeights"),
-        ({"mesh": jax.devices()}, "mesh is .*expected a jax.sharding.Mesh"),
+        ({"mesh": jax.devices()}, "device_mesh is .*expected a jax.sharding.Mesh"),
     ],
 )
 def test_bad_input_is_refused(imitate, reference, settings, message):
@@ -129,7 +129,7 @@ def test_a_demonstration_of_one_pose_is_found_where_it_is_free(imitate, demonstr
     one = dataclasses.replace(demonstration, trajectory=tdf.Trajectory(demonstration.trajectory.wxyz_xyz[:1]))
     for inits in (3, 1):
         result = imitate(one, fix_last=False, config=dataclasses.replace(config, inits=inits))
-        assert result.trajectory.poses == 1 and np.isfinite(result.energies).all()
+        assert result.trajectory.num_poses == 1 and np.isfinite(result.energies).all()
     with pytest.raises(InputError, match="one pose and fix_last keeps it; expected fix_last=False"):
         imitate(one, config=config)
 

@@ -181,7 +181,7 @@ def test_the_goal_is_the_demonstrations_carried_by_the_centroids_and_offset(imit
 def test_both_trajectory_files_hold_the_best(folder):
     npz, tum = (tdf.load_trajectory(folder / f"trajectory.{kind}") for kind in ("npz", "tum"))
     np.testing.assert_array_equal(npz.wxyz_xyz, tum.wxyz_xyz.astype(np.float32))
-    assert npz.poses == 4
+    assert npz.num_poses == 4
 
 
 def test_a_seed_gives_the_same_run_and_another_another(imitate, folder):
@@ -296,7 +296,7 @@ def test_generated_demonstrations_go_from_the_handle_to_the_place(shape):
 @pytest.mark.parametrize(("poses", "words"), [(4, ()), (6, ("--poses", 4))])
 def test_an_own_demonstration(imitate, tmp_path, poses, words):
     points = np.random.default_rng(0).normal(size=(70, 3)).astype(np.float32)
-    demonstration = tdf.Demonstration(points, tdf.line(poses=poses), tdf.box_query(jax.random.key(0), 8))
+    demonstration = tdf.Demonstration(points, tdf.line(num_poses=poses), tdf.box_query(jax.random.key(0), 8))
     save_demonstration(tmp_path / "demo.npz", demonstration)
     record = imitate("--demonstration", tmp_path / "demo.npz", *QUICK, *words)
     assert record["demonstration"] == {"points": 70, "poses": 4, "queries": 8}
@@ -343,7 +343,7 @@ def test_bad_clouds(refusal, weights, tmp_path, name, option):
     if option == "--target":
         np.save(path := tmp_path / "cloud.npy", points)
     else:
-        rest = {"wxyz_xyz": np.asarray(tdf.line(poses=3).wxyz_xyz), "query": np.zeros((4, 3))}
+        rest = {"wxyz_xyz": np.asarray(tdf.line(num_poses=3).wxyz_xyz), "query": np.zeros((4, 3))}
         np.savez(path := tmp_path / "demo.npz", points=points, **rest)
     check(refusal("imitate", "--weights", weights, option, path), f"^tdf: error: .*{message}")
 

@@ -33,6 +33,7 @@ def sweep(weights, tmp_path):
     return go
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("grid", "pictures"),
     [("yz", {"map.png"}), ("volume", {"isosurface.png", "slices.gif"}), ("path", {"isosurface.png", "slices.gif"})],

@@ -191,6 +191,7 @@ def test_a_second_call_computes_nothing(everything, weights, monkeypatch, capsys
     assert "fig5.png" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_one_parameter_can_be_changed(weights, tmp_path):
     main(
         [

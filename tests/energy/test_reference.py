@@ -97,7 +97,7 @@ def test_bad_demonstrations_are_refused(demonstration, change, message):
 
 
 def test_demonstrations_that_do_not_fit_together_are_refused(small_model, demonstration):
-    longer = dataclasses.replace(demonstration, trajectory=tdf.wave(poses=5))
+    longer = dataclasses.replace(demonstration, trajectory=tdf.wave(num_poses=5))
     elsewhere = dataclasses.replace(demonstration, query=demonstration.query + 0.01)
     for second in (longer, elsewhere):
         with pytest.raises(InputError, match="differ in their query points or number of poses"):

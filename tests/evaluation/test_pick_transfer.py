@@ -197,6 +197,7 @@ def test_a_transfer_between_objects_of_half_the_size_is_asked_with_half_the_quer
     assert sizes == [QUERY_SIZE, QUERY_SIZE / 2]
 
 
+@pytest.mark.slow
 def test_every_case_and_network_runs_the_programs_of_the_first(small_model):
     """Clouds of any number of points are thinned to one; no later case compiles anything."""
     model = dataclasses.replace(small_model, info=tdf.ModelInfo("small", "a test", cloud_points=40))
@@ -219,6 +220,7 @@ def test_an_unknown_baseline_is_told_before_anything_runs():
         compare([], None, ("ICP", "RANSAC"))
 
 
+@pytest.mark.slow
 def test_the_shipped_weights_transfer_a_pose_and_random_ones_do_not():
     model = tdf.load_model("mug")
     cases = [mug_case(0, index) for index in range(3)]

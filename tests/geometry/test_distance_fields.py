@@ -150,6 +150,7 @@ def mug():
     return made, moved, points, tdf.refine(model, tdf.encode(model, points), points)
 
 
+@pytest.mark.slow
 def test_distances_to_a_field_are_those_to_the_mug(mug):
     made, moved, points, field = mug
     igl = pytest.importorskip("igl")

@@ -26,7 +26,7 @@ def test_the_default_semicircle_by_hand():
 
 def test_the_default_wave_by_hand():
     """One sine of amplitude 0.3 / 4: its crest is at a quarter of the way, its middle on the chord."""
-    t = np.array(wave(poses=9).translations)
+    t = np.array(wave(num_poses=9).translations)
     np.testing.assert_allclose(t[[0, 2, 4, 6, 8], 0], [0, 0.075, 0, -0.075, 0], atol=1e-6)
     np.testing.assert_allclose(t[[0, 2, 4, 6, 8], 1], [0, 0.075, 0.15, 0.225, 0.3], atol=1e-6)
     np.testing.assert_allclose(t[:, 0], 0.075 * np.sin(2 * np.pi * t[:, 1] / 0.3), atol=1e-6)
@@ -48,7 +48,7 @@ def test_heights_and_bulges():
 def test_paths_keep_their_ends_and_are_evenly_spaced(path, poses):
     start, end = (0.1, -0.2, 0.3), (-0.4, 0.5, 0.1)
     trajectory = path(poses, start, end)
-    assert trajectory.poses == poses
+    assert trajectory.num_poses == poses
     assert trajectory.wxyz_xyz.dtype == jnp.float32
     np.testing.assert_allclose(trajectory.translations[0], start, atol=1e-7)
     np.testing.assert_allclose(trajectory.translations[-1], end, atol=1e-7)

@@ -4,7 +4,6 @@ import itertools
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -261,7 +260,10 @@ def test_rotate_pairs_each_rotation_with_its_points(dtype):
     np.testing.assert_allclose(se3.rotate(R, x), np.einsum("bpij,pqj->bpqi", R, x), atol=TOLERANCE[dtype])
 
 
+@pytest.mark.slow
 def test_the_layout_is_jaxlies():
+    import jaxlie
+
     a, b, x = random_poses((5,), jnp.float32, 13), random_poses((5,), jnp.float32, 14), np.float32(axes()[:5])
 
     @jax.jit

@@ -53,11 +53,12 @@ def test_the_nearest_turn_is_the_best_of_all_that_are_allowed(fold, seed):
     """Noisy points off the axis, turned by angles all around: no allowed turn brings the true ones nearer."""
     rng = np.random.default_rng(seed)
     truth = rng.normal(size=(7, 3)) + [0.8, 0.3, 5.0]
+    candidates = np.stack([turned(truth, other) for other in turns(fold)])
     for angle in rng.uniform(-np.pi, np.pi, 40):
         found = turned(truth, angle) + 0.3 * rng.normal(size=truth.shape)
         turn = nearest_turn(found, truth, fold)
         assert isinstance(turn, float) and abs(turn) <= np.pi + 1e-9
-        distances = np.array([squared(found, turned(truth, other)) for other in turns(fold)])
+        distances = np.sum((found - candidates) ** 2, axis=(1, 2))
         assert squared(found, turned(truth, turn)) <= distances.min() + 1e-9
         off = np.abs(np.angle(np.exp(1j * (turns(fold) - turn))))
         assert off.min() < (1e-9 if fold else 2 * np.pi / STEPS)  # it is one of them

@@ -10,7 +10,7 @@ from tdf_jax.io.demonstrations import load_demonstration, save_demonstration
 @pytest.fixture
 def demonstration():
     points = np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32)
-    return tdf.Demonstration(points, tdf.semicircle(poses=4), tdf.box_query(jax.random.key(1), count=5))
+    return tdf.Demonstration(points, tdf.semicircle(num_poses=4), tdf.box_query(jax.random.key(1), count=5))
 
 
 def arrays(demonstration):

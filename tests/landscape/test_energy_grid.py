@@ -16,6 +16,7 @@ from tdf_jax.geometry.grid import Grid, path_grid, plane_grid, volume_grid
 from tdf_jax.landscape import shared_lattice
 from tdf_jax.landscape.energy_grid import blank, energy_landscape, fill, query_change
 
+SLOW = pytest.mark.slow
 RANDOM = np.asarray(se3.rotation(jnp.asarray(random_poses(5, 3), jnp.float32)))
 
 
@@ -45,7 +46,7 @@ def small_tiles(monkeypatch):
         monkeypatch.setattr(shared_lattice, name, value)
 
 
-@pytest.mark.parametrize("R", [None, RANDOM[0]], ids=["upright", "turned"])
+@pytest.mark.parametrize("R", [None, pytest.param(RANDOM[0], marks=SLOW)], ids=["upright", "turned"])
 def test_energies_equal_those_of_single_poses(field, reference, R, small_tiles):
     grid = Grid(np.asarray(field.origin), np.eye(3)[:2], (np.linspace(-0.1, 0.1, 4), np.linspace(-0.2, 0.1, 11)))
     landscape = energy_landscape(field, reference, grid, R)
@@ -53,8 +54,8 @@ def test_energies_equal_those_of_single_poses(field, reference, R, small_tiles):
     check(field, reference, landscape, np.eye(3) if R is None else R, [(0, 0), (3, 10), (1, 2), (2, 8)])
 
 
-@pytest.mark.parametrize("axes", ["plane", "volume", "line"])
-@pytest.mark.parametrize("R", [np.eye(3), RANDOM[1]], ids=["upright", "turned"])
+@pytest.mark.parametrize("axes", ["plane", pytest.param("volume", marks=SLOW), pytest.param("line", marks=SLOW)])
+@pytest.mark.parametrize("R", [pytest.param(np.eye(3), marks=SLOW), RANDOM[1]], ids=["upright", "turned"])
 def test_shared_energies_equal_those_of_single_poses(field, lattice_reference, axes, R, small_tiles):
     count = {"line": 1, "plane": 2, "volume": 3}[axes]
     coordinates = tuple(0.012 * np.arange(-2, size) for size in (4, 3, 7)[:count])

@@ -67,6 +67,7 @@ def test_encode_gives_the_originals_latents(golden, precision):
 MUTATIONS = {"removed": np.zeros_like, "permuted": lambda tensor: np.roll(tensor, 1, axis=0)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mutation", MUTATIONS)
 def test_parity_fails_without_any_one_tensor(golden, mutation):
     """Parity would prove little if a tensor did not matter: each, changed alone, must show in what parity compares."""

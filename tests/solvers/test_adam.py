@@ -22,6 +22,7 @@ from tdf_jax.solvers.initial import default_goal, random_starts
 CONFIG = tdf.OptimizeConfig(inits=3, iterations=5)
 WEIGHTS = tdf.EnergyWeights(correlation=0.3, compensator=0.1, lever=0.2)
 KEY = jax.random.key(0)
+SLOW = pytest.mark.slow
 
 
 def run(field, reference, key=KEY, config=CONFIG, energy=WEIGHTS, **settings):
@@ -56,7 +57,9 @@ def energies(field, reference):
 # ---- the gradient ----
 
 
-@pytest.mark.parametrize(("fix_last", "chunk"), [(True, 64), (True, 2), (False, 64)])
+@pytest.mark.parametrize(
+    ("fix_last", "chunk"), [(True, 2), pytest.param(True, 64, marks=SLOW), pytest.param(False, 64, marks=SLOW)]
+)
 def test_the_chunked_gradient_is_that_of_the_energy(field, reference, energies, fix_last, chunk):
     """After one step, Adam's first moments are a tenth of the gradient. 9 or 12 poses: with and without a remainder."""
     starts = random_starts(KEY, field, reference, 3, "scattered", 0.1)
@@ -71,6 +74,7 @@ def test_the_chunked_gradient_is_that_of_the_energy(field, reference, energies, 
         np.testing.assert_allclose(10 * moment, expected, atol=2e-4 * np.abs(gradient).max())
 
 
+@pytest.mark.slow
 def test_the_result_does_not_depend_on_the_chunk(field, reference):
     one_step = dataclasses.replace(CONFIG, iterations=1)
     whole, parts = (run(field, reference, config=dataclasses.replace(one_step, chunk=chunk)) for chunk in (64, 2))
@@ -297,6 +301,7 @@ def test_what_is_traced_does_not_compile_again(small_model, demonstration, field
     assert not programs & {name.removeprefix("jit(").removesuffix(")") for name in compiled}
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_number_of_starts(quick_compilation):
     """64 starts of 7 poses and 64 query points have 37 MB of descriptors in this network; a chunk has 0.7."""
     config = dataclasses.replace(SMALL, latent=64, decoder_width=64)

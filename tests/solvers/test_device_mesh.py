@@ -5,6 +5,8 @@ import socket
 import subprocess
 import sys
 
+import pytest
+
 # Argument 1 is the folder of conftest.py; with two more, the process is one of two and holds four of eight devices.
 SCRIPT = """
 import sys; sys.path.insert(0, sys.argv[1])
@@ -70,11 +72,13 @@ def processes(tmp_path, devices, arguments):
     return [(one.communicate(timeout=300), one.returncode) for one in running]
 
 
+@pytest.mark.slow
 def test_eight_devices(tmp_path):
     ((output, error), code) = processes(tmp_path, 8, [[]])[0]
     assert code == 0 and output == "equal\n", error
 
 
+@pytest.mark.slow
 def test_two_processes(tmp_path):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

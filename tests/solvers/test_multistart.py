@@ -24,6 +24,7 @@ CONFIG = SolveConfig(inits=3, scouts=8, points=3, steps=(2, 1, 3, 2, 2, 3), tole
 LONG = (2, 1, 3, 2, 2, 30)
 WEIGHTS = tdf.EnergyWeights(correlation=0.3, lever=0.2)
 KEY = jax.random.key(0)
+SLOW = pytest.mark.slow
 
 
 def run(field, reference, key=KEY, config=CONFIG, energy=WEIGHTS, **settings):
@@ -48,7 +49,10 @@ def moved(R, place, step):
     return se3.exp(step[:3]) @ R, place + step[3:]
 
 
-@pytest.mark.parametrize("pose_norm", ["frobenius", "metres_radians", "mean_absolute"])
+@pytest.mark.parametrize(
+    "pose_norm",
+    ["frobenius", pytest.param("metres_radians", marks=SLOW), pytest.param("mean_absolute", marks=SLOW)],
+)
 def test_energies_and_gradients_are_those_of_the_energy(field, reference, pose_norm):
     """All 8 query points, in blocks of 3: the last block is filled up with a point that must not count."""
     weights = tdf.EnergyWeights(0.3, 0.0, 0.2, pose_norm)
@@ -209,6 +213,7 @@ def test_a_free_last_pose_moves_and_energies_are_of_all_poses(field, reference):
     assert free.loss < fixed.loss
 
 
+@pytest.mark.slow
 def test_it_reaches_what_adam_reaches(field, reference):
     """On random networks minima are many: 20 starts each, of both kinds."""
     for start in ("carried", "scattered"):

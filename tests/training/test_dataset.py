@@ -265,6 +265,7 @@ def test_the_recipes_symmetry_is_that_of_its_meshes(meshes, tmp_path):
         quiet_build(scanned_recipe(meshes, fold=0), tmp_path / "data")
 
 
+@pytest.mark.slow
 def test_processes_give_the_same(tmp_path):
     """Started afresh, they see nothing of this test's patches, so with the shipped number of occluders."""
     recipe = dataclasses.replace(RECIPE, objects=2)

@@ -83,6 +83,7 @@ def metrics(directory):
     return [{name: value for name, value in row.items() if name != "seconds"} for row in rows]
 
 
+@pytest.mark.slow
 def test_training_lowers_the_loss(whole):
     folder, params = whole
     rows = metrics(folder)
@@ -99,6 +100,7 @@ def test_training_lowers_the_loss(whole):
     assert shapes == dict(parameter_shapes(NETWORK))
 
 
+@pytest.mark.slow
 def test_a_run_gives_the_average_over_its_latest_steps(train, tmp_path, monkeypatch):
     taken, step = [], loop._step
 
@@ -145,6 +147,7 @@ def test_a_killed_run_resumes_to_the_same_numbers(train, whole, tmp_path, monkey
     assert sorted(path.name for path in tmp_path.iterdir()) == ["config.json", "metrics.jsonl", "state.msgpack"]
 
 
+@pytest.mark.slow
 def test_a_network_of_two_data_sets_trains_and_resumes_to_the_same_numbers(train, two_sets, tmp_path, monkeypatch):
     """Killed at its fifth step and begun again; validation is on pairs of mugs and pairs of bowls, never of both."""
     params = train(CONFIG, tmp_path / "whole", data=two_sets)
@@ -216,6 +219,7 @@ def test_metrics_cut_short_anywhere_are_dropped(tmp_path):
         assert (tmp_path / "metrics.jsonl").read_text() == whole + "\n"
 
 
+@pytest.mark.slow
 def test_a_run_may_go_on_from_weights(train, whole, tmp_path):
     """It starts where the weights left off, with its frame read out again, not from the beginning."""
     before = jax.tree.map(np.array, whole[1])
@@ -228,6 +232,7 @@ def test_a_run_may_go_on_from_weights(train, whole, tmp_path):
     assert first["frame"] < 0.3 * fresh["frame"]
 
 
+@pytest.mark.slow
 def test_clouds_are_as_sensors_give_them_from_the_first_step_of_a_run_that_goes_on(train, whole, tmp_path, monkeypatch):
     asked, drawn = [], loop.draw
     monkeypatch.setattr(loop, "draw", lambda *arguments: (asked.append(arguments[5]), drawn(*arguments))[1])
@@ -239,6 +244,7 @@ def test_clouds_are_as_sensors_give_them_from_the_first_step_of_a_run_that_goes_
     assert asked[1] == 0.0 and asked[4] == 0.5
 
 
+@pytest.mark.slow
 def test_minutes_become_steps(sets, monkeypatch):
     clock = iter(np.arange(0, 1000, 0.5))
     monkeypatch.setattr(loop.time, "monotonic", lambda: next(clock))

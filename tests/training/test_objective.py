@@ -29,6 +29,7 @@ def samples():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("asymmetry", [0.0, 0.1])
 def test_a_batch_taken_together_has_the_gradients_of_its_pairs_one_by_one(small_model, samples, monkeypatch, asymmetry):
     config = dataclasses.replace(SMALL, asymmetry=asymmetry)

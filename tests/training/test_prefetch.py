@@ -59,7 +59,7 @@ def test_batches_come_in_the_order_of_steps_and_do_not_depend_on_who_draws_them(
                 assert found.dtype == expected.dtype
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_what_fails_while_drawing_is_raised_at_its_step(data, workers):
     with drawn_ahead(failing, data, 0, workers) as batches:
         assert [next(batches), next(batches)] == [0, 1]
@@ -67,13 +67,14 @@ def test_what_fails_while_drawing_is_raised_at_its_step(data, workers):
             next(batches)
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_one_worker_is_a_thread_and_several_are_processes(data, workers):
     with drawn_ahead(who, data, 0, workers) as batches:
         drew = {next(batches) for _ in range(20)}
     assert drew == {os.getpid()} if workers == 1 else os.getpid() not in drew and len(drew) <= 2
 
 
+@pytest.mark.slow
 def test_what_processes_draw_from_is_not_left_behind(data, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     with drawn_ahead(who, data, 0, 2) as batches:
@@ -96,6 +97,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_a_killed_run_leaves_neither_processes_nor_files(data, folder, tmp_path):
     script, scratch = tmp_path / "run.py", tmp_path / "scratch"
     script.write_text(RUN)
@@ -108,6 +110,7 @@ def test_a_killed_run_leaves_neither_processes_nor_files(data, folder, tmp_path)
     assert not list(scratch.iterdir())
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_is_told(data):
     with drawn_ahead(dying, data, 0, 2) as batches, pytest.raises(InputError, match="a process that drew samples died"):
         next(batches)

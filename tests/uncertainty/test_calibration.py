@@ -67,7 +67,7 @@ def test_a_fit_finds_the_curve_that_the_cases_were_drawn_from():
 
 def test_shipped_weights_judge_the_object_and_others_do_not(small_model, monkeypatch):
     cloud, other = (random_cloud(seed).astype(np.float32) for seed in (3, 4))
-    demonstration = tdf.Demonstration(cloud, tdf.line(poses=2), tdf.box_query(KEY, 8))
+    demonstration = tdf.Demonstration(cloud, tdf.line(num_poses=2), tdf.box_query(KEY, 8))
     config = tdf.CarryConfig(scouts=2, finalists=1, points=4, steps=(1, 1, 1, 1))
 
     def found(name, curve):
@@ -89,6 +89,7 @@ def test_shipped_weights_judge_the_object_and_others_do_not(small_model, monkeyp
     assert result.recognised == pytest.approx(tdf.recognition(*evidence, (0.3, 0.1, 0.1)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("weights", "shown", "category", "doubted"), [
     ("mug", "mug", "mug", False),
     ("mug", "mug", "bottle", True),

@@ -383,6 +383,7 @@ def at(*place):
     return np.block([[np.eye(3), np.array(place)[:, None]], [np.zeros(3), 1]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [at(-0.04, 0, 0.05), at(0.06, 0, 0), at(0, 0, 0.05)], ids=["rim", "side", "axis"])
 def test_a_cup_without_handle_is_free_to_turn_about_its_axis(mug_model, query, place, quick_compilation):
     found = transferred(mug_model, query, cup(0, 0.040, 0.045), cup(1, 0.038, 0.043), place)
@@ -396,6 +397,7 @@ def test_a_cup_without_handle_is_free_to_turn_about_its_axis(mug_model, query, p
     assert np.linalg.norm(point[:2]) < 0.003 and abs(screw.pitch) < 0.001
 
 
+@pytest.mark.slow
 def test_a_mug_with_a_handle_is_not(mug_model, query, quick_compilation):
     a, b = tdf.build_mug(), tdf.build_mug(tdf.sample_mug(np.random.default_rng(77)))
     clouds = (np.asarray(tdf.sample_surface(one.mesh, 1500, 0)) for one in (a, b))

@@ -90,6 +90,7 @@ def test_slices_go_through_the_volume(tmp_path, marks):
         terrain.save_slices(tmp_path / "no folder" / "it.gif", landscape, marks)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axes", [2, 3])
 @pytest.mark.parametrize("masked", [False, True])
 def test_a_page_needs_no_network(tmp_path, marks, axes, masked):

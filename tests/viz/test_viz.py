@@ -15,7 +15,7 @@ from tdf_jax.viz.style import save_figure
 @pytest.fixture(scope="module")
 def demonstration():
     points = np.random.default_rng(0).uniform(-0.05, 0.05, (40, 3)).astype(np.float32)
-    return tdf.Demonstration(points, tdf.wave(poses=5), tdf.box_query(jax.random.key(0), 30, 0.06))
+    return tdf.Demonstration(points, tdf.wave(num_poses=5), tdf.box_query(jax.random.key(0), 30, 0.06))
 
 
 def lines(axes):
@@ -32,7 +32,7 @@ def drawn(monkeypatch):
 
 
 def test_both_sides_show_their_path_in_centimetres_at_one_scale(demonstration, drawn):
-    found, truth = tdf.line(poses=5, end=(0.1, 0.3, 0.1)), tdf.semicircle(poses=5, end=(0.1, 0.3, 0.1))
+    found, truth = tdf.line(num_poses=5, end=(0.1, 0.3, 0.1)), tdf.semicircle(num_poses=5, end=(0.1, 0.3, 0.1))
     moved = demonstration.points + np.float32(1.0)
     figure = imitation_figure(demonstration, moved, found, truth, title="loss 0.1")
     reference, test, bar = figure.axes

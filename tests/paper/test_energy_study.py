@@ -4,14 +4,16 @@ import dataclasses
 import json
 
 import numpy as np
+import pytest
 
 import tdf_jax as tdf
-from bench import energies
+from tdf_jax.paper import energy_study as energies
 
 
+@pytest.mark.slow
 def test_it_keeps_what_is_done_and_tells_the_distribution(small_model, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
-        tdf,
+        energies,
         "load_model",
         lambda name: dataclasses.replace(small_model, info=tdf.ModelInfo("small", "a test", cloud_points=40)),
     )
