@@ -7,6 +7,7 @@ Modules:
     cases: pairs of objects with a true pose
     comparison: a network beside baselines
     conditions: complete, partial, sparse and noisy clouds
+    clearance_study: colliding paths in random scenes, pushed clear
     demonstration_count: picks from several demonstrations
     methods: methods that imitate a whole trajectory
     metrics: errors of poses, paths and motions
@@ -17,6 +18,7 @@ Modules:
     path_tasks: tasks: a demonstration, a target, a goal, the truth
     pick_transfer: one pose transferred; reconstruction
     places: places of a mug, measured
+    recognition_study: objects of another category, recognised by the match
     report: table and file of `tdf evaluate`
     scene: a demonstration and a target in one world
     statistics: medians, success rates, intervals

@@ -1,4 +1,4 @@
-"""Whether objects of a wrong category are noticed: python -m bench.recognition --weights mug.
+"""Whether objects of a wrong category are noticed: python -m tdf_jax.evaluation.recognition_study --weights mug.
 
 Every case has a demonstration at the usual place of an unseen generated object. A right one is imitated on another
 object of that category, a wrong one on an object of another; the target is seen in turn complete, by one camera, by
@@ -13,30 +13,35 @@ from pathlib import Path
 import jax
 import numpy as np
 
-import tdf_jax as tdf
+from tdf_jax._internal.errors import CategoryWarning
 from tdf_jax.evaluation.cases import generated_case
 from tdf_jax.evaluation.pick_transfer import QUERIES, QUERY_SIZE
 from tdf_jax.evaluation.scene import place_demonstration
+from tdf_jax.geometry.query import box_query
+from tdf_jax.imitation import imitate
+from tdf_jax.networks.checkpoint import load_model
+from tdf_jax.networks.encoding import encode
+from tdf_jax.networks.model import Model
 from tdf_jax.shapes import FAMILIES
-from tdf_jax.uncertainty.calibration import CURVES, logistic, ranking
+from tdf_jax.uncertainty.calibration import CURVES, logistic, ranking, recognition, surface_logit
 
 CLOUDS = ("full", "views1", "views2", "noise")
 THRESHOLDS = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
-def evidence(model: tdf.Model, category: str, seed: int, index: int, right: bool) -> tuple[float, float]:
+def evidence(model: Model, category: str, seed: int, index: int, right: bool) -> tuple[float, float]:
     """Residual and surface logit of one case."""
     clouds, others = CLOUDS[index % len(CLOUDS)], [name for name in FAMILIES if name != category]
     shown = generated_case(category, seed, index, clouds=clouds)
     target = shown if right else generated_case(others[index // len(CLOUDS) % len(others)], seed, index, clouds=clouds)
-    demonstration = place_demonstration(shown, "line", 2, tdf.box_query(jax.random.key(seed), QUERIES, QUERY_SIZE))
+    demonstration = place_demonstration(shown, "line", 2, box_query(jax.random.key(seed), QUERIES, QUERY_SIZE))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", tdf.CategoryWarning)
-        result = tdf.imitate(model, demonstration, target.points_b, key=jax.random.key(index), fix_last=False)
-    return result.residual, tdf.surface_logit(tdf.encode(model, target.points_b), target.points_b)
+        warnings.simplefilter("ignore", CategoryWarning)
+        result = imitate(model, demonstration, target.points_b, key=jax.random.key(index), fix_last=False)
+    return result.residual, surface_logit(encode(model, target.points_b), target.points_b)
 
 
-def collected(model: tdf.Model, category: str, seed: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def collected(model: Model, category: str, seed: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Evidence (2 count, 2), whether the object was of the category, and the number of its cloud in `CLOUDS`, both (2 count,)."""
     rows, right = [], []
     for index in range(count):
@@ -54,7 +59,7 @@ def features(rows: np.ndarray) -> np.ndarray:
 
 def report(rows: np.ndarray, right: np.ndarray, seen: np.ndarray, curve) -> dict:
     """The area under the ROC and points of it, of the curve and of the residual alone."""
-    predicted = np.array([tdf.recognition(*row, tuple(curve)) for row in rows])
+    predicted = np.array([recognition(*row, tuple(curve)) for row in rows])
     points = {
         str(one): {
             "wrong_noticed": float(np.mean(predicted[right == 0] < one)),
@@ -80,7 +85,7 @@ def main() -> None:
     settings = parser.parse_args()
     if settings.count < 1:
         parser.error(f"--count is {settings.count}; expected at least 1")
-    model = tdf.load_model(settings.weights)
+    model = load_model(settings.weights)
     if not settings.fit and model.info.name not in CURVES:
         parser.error(
             f"--weights is {settings.weights}, which has no curve; expected one of {', '.join(CURVES)}, or --fit"

@@ -1,4 +1,4 @@
-"""Random scenes in which replay collides, pushed clear: python -m bench.clearance."""
+"""Random scenes in which replay collides, pushed clear: python -m tdf_jax.evaluation.clearance_study."""
 
 import argparse
 import time
@@ -6,9 +6,9 @@ import time
 import jax
 import numpy as np
 
-import tdf_jax as tdf
 from tdf_jax.geometry.distance_fields import box_obstacle
 from tdf_jax.geometry.paths import SHAPES
+from tdf_jax.geometry.query import gripper_query
 from tdf_jax.planning.avoidance import push_clear
 from tdf_jax.planning.distances import clearance
 
@@ -41,7 +41,7 @@ def main() -> None:
     count = parser.parse_args().scenes
     if count < 1:
         parser.error(f"--scenes is {count}; expected at least 1")
-    body = tdf.gripper_query(jax.random.key(0), 300)
+    body = gripper_query(jax.random.key(0), 300)
     rows = []
     for seed in range(count):
         path, boxes = scene(seed, body)
