@@ -131,7 +131,7 @@ CUT = 3.0  # occupancy logits beyond it count no further: a few stray points mus
 
 
 # Logistic in (-log residual, surface logit), by name of shipped weights: intercept and two slopes, fitted on right and
-# wrong cases of seed 61 by `python -m bench.recognition --fit`: 40 of each for mugs, 32 for bowls and for bottles, 48
+# wrong cases of seed 61 by `python -m tdf_jax.evaluation.recognition_study --fit`: 40 of each for mugs, 32 for bowls and for bottles, 48
 # for all three. Tried on others: docs/results/uncertainty.md.
 CURVES = {
     "mug": (-2.77, 6.25, 4.76),
