@@ -188,7 +188,7 @@ def _record(
         "machine": {"jax": jax.__version__, "device": jax.devices()[0].device_kind, "backend": jax.default_backend()},
         "demonstration": {
             "points": len(demonstration.points),
-            "poses": demonstration.trajectory.poses,
+            "poses": demonstration.trajectory.num_poses,
             "queries": len(demonstration.query),
         },
         "target": {"points": len(scene.points), "T_world_target": scene.T_world_target.tolist()},

@@ -59,7 +59,7 @@ def landscape(settings: Annotated[LandscapeSettings, tyro.conf.arg(name="")] = L
     waypoints = np.asarray(given.trajectory.translations + field.origin, dtype=float)
     rotations = _rotations(settings, np.asarray(given.trajectory.rotations[0], dtype=float))
     axes = rotations[0].T if settings.rotation in ("pick", "identity") else np.eye(3)
-    _check_size(settings, waypoints, given.trajectory.poses)
+    _check_size(settings, waypoints, given.trajectory.num_poses)
     _check_extras(settings)
     grid = _grid(settings, waypoints, axes)
     query = _query(settings, np.asarray(scene.demonstration.query))

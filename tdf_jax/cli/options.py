@@ -256,7 +256,7 @@ def _read_demonstration(settings: SceneSettings) -> Demonstration | None:
     if settings.demonstration is None:
         return None
     shown = load_demonstration(settings.demonstration)
-    if settings.poses in (None, shown.trajectory.poses):
+    if settings.poses in (None, shown.trajectory.num_poses):
         return shown
     return dataclasses.replace(shown, trajectory=resample(shown.trajectory, settings.poses))
 

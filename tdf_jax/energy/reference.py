@@ -60,7 +60,7 @@ def describe(model: Model, demonstrations: Demonstration | Sequence[Demonstratio
         raise InputError(f"describe(): got {', '.join(kinds) or 'nothing'}; expected one or more of tdf.Demonstration")
     first = demonstrations[0]
     for other in demonstrations[1:]:
-        if other.trajectory.poses != first.trajectory.poses or not np.array_equal(other.query, first.query):
+        if other.trajectory.num_poses != first.trajectory.num_poses or not np.array_equal(other.query, first.query):
             raise InputError(
                 "describe(): demonstrations differ in their query points or number of poses; expected the same. "
                 "Use one query set and resample() the trajectories"

@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.deprecation import renamed_keywords
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.trajectory import Trajectory, resample
@@ -13,8 +14,9 @@ from tdf_jax.geometry.trajectory import Trajectory, resample
 UPRIGHT = 0.6  # of the way across, before `tilt_and_pour` tilts
 
 
+@renamed_keywords(poses="num_poses")
 def line(
-    poses: int = 7,
+    num_poses: int = 7,
     start: ArrayLike = (0.0, 0.0, 0.0),
     end: ArrayLike = (0.0, 0.3, 0.0),
     *,
@@ -24,7 +26,7 @@ def line(
     """Straight trajectory, evenly spaced.
 
     Args:
-        poses: Number of poses, at least 2.
+        num_poses: Number of poses, at least 2.
         start: Translation of the first pose, metres.
         end: Translation of the last pose, metres.
         rotation: Orientation, 3x3 or wxyz; default the world's.
@@ -36,11 +38,12 @@ def line(
     Raises:
         InputError: If an argument has a wrong shape or value, or start and end are the same place.
     """
-    return _trajectory("line", poses, start, end, rotation, end_rotation, lambda s, chord: (s * chord, 0 * s))
+    return _trajectory("line", num_poses, start, end, rotation, end_rotation, lambda s, chord: (s * chord, 0 * s))
 
 
+@renamed_keywords(poses="num_poses")
 def semicircle(
-    poses: int = 7,
+    num_poses: int = 7,
     start: ArrayLike = (0.0, 0.0, 0.0),
     end: ArrayLike = (0.0, 0.3, 0.0),
     *,
@@ -52,7 +55,7 @@ def semicircle(
     """Circular arc from start to end, evenly spaced; by default half a circle.
 
     Args:
-        poses, start, end, rotation, end_rotation: As for `line`.
+        num_poses, start, end, rotation, end_rotation: As for `line`.
         height: Distance of the arc's middle from the chord, metres; default half the chord, a half circle.
         bulge: Direction the arc bows to; its part perpendicular to the chord counts. The default keeps the default
             ends' path in the x-y plane, as in the paper's figure 2; (0, 0, 1) lifts it.
@@ -72,11 +75,12 @@ def semicircle(
         angle = half_angle * (2 * s - 1)
         return chord / 2 + radius * np.sin(angle), radius * (np.cos(angle) - np.cos(half_angle))
 
-    return _trajectory("semicircle", poses, start, end, rotation, end_rotation, arc, height, bulge)
+    return _trajectory("semicircle", num_poses, start, end, rotation, end_rotation, arc, height, bulge)
 
 
+@renamed_keywords(poses="num_poses")
 def wave(
-    poses: int = 7,
+    num_poses: int = 7,
     start: ArrayLike = (0.0, 0.0, 0.0),
     end: ArrayLike = (0.0, 0.3, 0.0),
     *,
@@ -88,7 +92,7 @@ def wave(
     """One period of a sine from start to end, first to the side of bulge; poses evenly spaced along the curve.
 
     Args:
-        poses, start, end, rotation, end_rotation: As for `line`.
+        num_poses, start, end, rotation, end_rotation: As for `line`.
         height: Amplitude, metres; default a quarter of the chord.
         bulge: Direction of the first crest; its part perpendicular to the chord counts. The default keeps the
             default ends' path in the x-y plane, as in the paper's figure 2; (0, 0, 1) lifts it first.
@@ -109,11 +113,12 @@ def wave(
         even = np.interp(s * length[-1], length, fine)
         return chord * even, amplitude * np.sin(2 * np.pi * even)
 
-    return _trajectory("wave", poses, start, end, rotation, end_rotation, sine, height, bulge)
+    return _trajectory("wave", num_poses, start, end, rotation, end_rotation, sine, height, bulge)
 
 
+@renamed_keywords(poses="num_poses")
 def lift_over(
-    poses: int = 7,
+    num_poses: int = 7,
     start: ArrayLike = (0.0, 0.0, 0.0),
     end: ArrayLike = (0.0, 0.3, 0.0),
     *,
@@ -125,7 +130,7 @@ def lift_over(
     """Straight up, across and down, over whatever stands between; evenly spaced.
 
     Args:
-        poses, start, end, rotation: As for `line`.
+        num_poses, start, end, rotation: As for `line`.
         height: Metres above start and end alike.
         up: Direction of the lift.
         end_rotation: Orientation of the last pose, reached on the way across; default no turn.
@@ -138,11 +143,12 @@ def lift_over(
     """
     start, end, R_start, R_end = _ends("lift_over", start, end, rotation, end_rotation)
     lift = _positive("lift_over", "height", height) * _direction("lift_over", "up", up)
-    return _through("lift_over", poses, [start, start + lift, end + lift, end], [R_start, R_start, R_end, R_end])
+    return _through("lift_over", num_poses, [start, start + lift, end + lift, end], [R_start, R_start, R_end, R_end])
 
 
+@renamed_keywords(poses="num_poses")
 def tilt_and_pour(
-    poses: int = 7,
+    num_poses: int = 7,
     start: ArrayLike = (0.0, 0.0, 0.0),
     end: ArrayLike = (0.0, 0.3, 0.0),
     *,
@@ -154,7 +160,7 @@ def tilt_and_pour(
     """Up, upright most of the way across, then tilted forwards while going down to the end; evenly spaced.
 
     Args:
-        poses, start, end, rotation: As for `line`.
+        num_poses, start, end, rotation: As for `line`.
         height: Metres above start and end at which it goes across.
         tilt: Radians that it is tilted at the end, less than half a turn, about the horizontal axis across the way.
         up: Direction of the lift.
@@ -176,14 +182,15 @@ def tilt_and_pour(
     upright = start + lift + UPRIGHT * (end - start)
     return _through(
         "tilt_and_pour",
-        poses,
+        num_poses,
         [start, start + lift, upright, end],
         [R_start, R_start, R_start, se3.multiply(turn, R_start)],
     )
 
 
+@renamed_keywords(poses="num_poses")
 def hang_on_rack(
-    poses: int = 7,
+    num_poses: int = 7,
     start: ArrayLike = (0.0, 0.0, 0.0),
     end: ArrayLike = (0.0, 0.3, 0.0),
     *,
@@ -194,7 +201,7 @@ def hang_on_rack(
     """To the front of a peg, turning on the way, then straight onto it without a turn; evenly spaced.
 
     Args:
-        poses, start, end, rotation: As for `line`.
+        num_poses, start, end, rotation: As for `line`.
         approach: The last straight part, from the peg's front to the end, metres.
         end_rotation: Orientation on the peg; by default `rotation` after a quarter turn about the approach.
 
@@ -215,17 +222,17 @@ def hang_on_rack(
     if end_rotation is None:
         quarter = se3.exp(jnp.asarray(np.pi / 2 * approach / np.linalg.norm(approach)))
         R_end = se3.multiply(quarter, R_start)
-    return _through("hang_on_rack", poses, [start, front, end], [R_start, R_end, R_end])
+    return _through("hang_on_rack", num_poses, [start, front, end], [R_start, R_end, R_end])
 
 
 SHAPES = {"line": line, "semicircle": semicircle, "wave": wave}  # the paper's
 PATHS = SHAPES | {"lift_over": lift_over, "tilt_and_pour": tilt_and_pour, "hang_on_rack": hang_on_rack}
 
 
-def _through(function, poses, places, rotations) -> Trajectory:
+def _through(function, num_poses, places, rotations) -> Trajectory:
     """Evenly spaced by length along the straight lines between key poses; turns are even on each."""
-    checks.count(f"{function}()", "num_poses", poses, least=2)
-    return resample(Trajectory(se3.pose(jnp.stack(rotations), jnp.asarray(np.stack(places)))), poses)
+    checks.count(f"{function}()", "num_poses", num_poses, least=2)
+    return resample(Trajectory(se3.pose(jnp.stack(rotations), jnp.asarray(np.stack(places)))), num_poses)
 
 
 def _ends(function, start, end, rotation, end_rotation):
@@ -261,9 +268,9 @@ def _rotation(function: str, rotation: ArrayLike) -> Float[Array, "3 3"]:
     return jnp.asarray(rotation)
 
 
-def _trajectory(function, poses, start, end, rotation, end_rotation, curve, height=None, bulge=None) -> Trajectory:
+def _trajectory(function, num_poses, start, end, rotation, end_rotation, curve, height=None, bulge=None) -> Trajectory:
     """Poses along `curve`: fractions in [0, 1] and the chord's length -> distances along the chord and across it."""
-    checks.count(f"{function}()", "num_poses", poses, least=2)
+    checks.count(f"{function}()", "num_poses", num_poses, least=2)
     start, end, R_start, R_end = _ends(function, start, end, rotation, end_rotation)
     chord = np.linalg.norm(end - start)
     if height is not None:
@@ -275,7 +282,7 @@ def _trajectory(function, poses, start, end, rotation, end_rotation, curve, heig
         if not np.linalg.norm(side) > 1e-6 * np.linalg.norm(bulge):
             raise InputError(f"{function}(): bulge {bulge.tolist()} is zero or along the chord; expected a way aside.")
         side /= np.linalg.norm(side)
-    fractions = np.linspace(0, 1, poses)
+    fractions = np.linspace(0, 1, num_poses)
     along, across = curve(fractions, chord)
     translations = start + along[:, None] * forward + across[:, None] * side
     return Trajectory(se3.pose(se3.geodesic(R_start, R_end, fractions), jnp.asarray(translations)))

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.deprecation import renamed_keywords, warn
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
 
@@ -28,9 +29,15 @@ class Trajectory:
     wxyz_xyz: Float[Array, "poses 7"]
 
     @property
-    def poses(self) -> int:
+    def num_poses(self) -> int:
         """Number of poses."""
         return self.wxyz_xyz.shape[-2]
+
+    @property
+    def poses(self) -> int:
+        """Former name of `num_poses`."""
+        warn("Trajectory.poses", "Trajectory.num_poses")
+        return self.num_poses
 
     @property
     def rotations(self) -> Float[Array, "poses 3 3"]:
@@ -132,7 +139,8 @@ def check_trajectory(trajectory: Trajectory, name: str = "trajectory") -> Trajec
     return trajectory
 
 
-def resample(trajectory: Trajectory, poses: int) -> Trajectory:
+@renamed_keywords(poses="num_poses")
+def resample(trajectory: Trajectory, num_poses: int) -> Trajectory:
     """The same path with another number of poses, evenly spaced by the length of the translations' polyline.
 
     Rotations turn evenly (slerp) between the poses of the original. A path that stays in one place is spaced by
@@ -140,23 +148,23 @@ def resample(trajectory: Trajectory, poses: int) -> Trajectory:
 
     Args:
         trajectory: The trajectory.
-        poses: New number of poses, at least 2.
+        num_poses: New number of poses, at least 2.
 
     Returns:
         The resampled trajectory; its ends are those of the original.
 
     Raises:
-        InputError: If poses is below 2, the trajectory has one pose, or it fails `check_trajectory`.
+        InputError: If num_poses is below 2, the trajectory has one pose, or it fails `check_trajectory`.
     """
-    checks.count("resample()", "num_poses", poses, least=2)
-    if check_trajectory(trajectory).poses < 2:
+    checks.count("resample()", "num_poses", num_poses, least=2)
+    if check_trajectory(trajectory).num_poses < 2:
         raise InputError("resample(): the trajectory has one pose; expected at least 2, a way between.")
     R, t = trajectory.rotations, trajectory.translations
     steps = jnp.linalg.norm(jnp.diff(t, axis=0), axis=1)
     steps = jnp.where(steps.sum() > 0, steps, 1.0)
     length = jnp.concatenate([jnp.zeros(1, steps.dtype), jnp.cumsum(steps)])
-    even = jnp.linspace(0, 1, poses, dtype=length.dtype) * length[-1]
-    i = jnp.clip(jnp.searchsorted(length, even, side="left") - 1, 0, trajectory.poses - 2)
+    even = jnp.linspace(0, 1, num_poses, dtype=length.dtype) * length[-1]
+    i = jnp.clip(jnp.searchsorted(length, even, side="left") - 1, 0, trajectory.num_poses - 2)
     fraction = (even - length[i]) / jnp.where(steps[i] > 0, steps[i], 1.0)
     translations = t[i] + fraction[:, None] * (t[i + 1] - t[i])
     return Trajectory(se3.pose(se3.geodesic(R[i], R[i + 1], fraction), translations))

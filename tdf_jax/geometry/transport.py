@@ -36,7 +36,7 @@ def carry_trajectory(demonstrated: Trajectory, pick: Float[Array, "7"], goal: Fl
     if goal is None:
         return demonstrated.transformed(pick_motion)
     goal_motion = se3.compose(goal, se3.inverse(demonstrated.wxyz_xyz[-1]))
-    s = jnp.arange(demonstrated.poses) / max(1, demonstrated.poses - 1)
+    s = jnp.arange(demonstrated.num_poses) / max(1, demonstrated.num_poses - 1)
     turn = se3.geodesic(se3.rotation(pick_motion), se3.rotation(goal_motion), s)
     t = demonstrated.translations
     carried = (1 - s)[:, None] * se3.transform(pick_motion, t) + s[:, None] * se3.transform(goal_motion, t)

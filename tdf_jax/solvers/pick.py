@@ -104,7 +104,7 @@ def carry(
     checks.key("carry()", key)
     if not isinstance(config, CarryConfig):
         raise InputError(f"carry(): config is {config!r}; expected a CarryConfig")
-    if fix_last and reference.trajectory.poses == 1:
+    if fix_last and reference.trajectory.num_poses == 1:
         raise InputError("carry(): the trajectory has one pose and fix_last keeps it; expected fix_last=False")
     if goal is not None and not fix_last:
         raise InputError("carry(): there is a goal, and fix_last=False does not keep it; drop one of them")

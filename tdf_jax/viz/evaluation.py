@@ -27,7 +27,7 @@ def truth_figure(tasks: Sequence[Task]) -> Figure:
             else f", goal {'opposite' if task.displacement == 'opposite' else 'moved by ' + task.displacement}"
         )
         views.append((task.path.replace("_", " ") + moved, view))
-    return panels(views, 3, bounds(np.asarray(tasks[0].demonstration.query)), tasks[0].expected.poses, share=0.78)
+    return panels(views, 3, bounds(np.asarray(tasks[0].demonstration.query)), tasks[0].expected.num_poses, share=0.78)
 
 
 def errors_figure(scores: Sequence[Score], bold: str) -> Figure:

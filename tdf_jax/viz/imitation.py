@@ -55,7 +55,7 @@ def imitation_figure(
             frame(axes, contents[column], size)
             axes.set_title(name, y=0.99)
             legend |= legend_of(axes)
-        waypoint_bar(figure, trajectory.poses, (0.62, 0.085, 0.3, 0.025))
+        waypoint_bar(figure, trajectory.num_poses, (0.62, 0.085, 0.3, 0.025))
         placing = {"loc": "lower left", "bbox_to_anchor": (0.02, 0.0), "frameon": False}
         figure.legend(legend.values(), legend.keys(), **placing)
         figure.suptitle(title, y=0.98)

@@ -73,7 +73,7 @@ def test_orientations_turn_evenly_from_one_to_the_other(path):
 def test_paths_refuse_bad_arguments(path):
     name = path.__name__
     for poses in (1, 0, -3, 2.5):
-        with pytest.raises(InputError, match=rf"{name}\(\): poses is {poses}; expected a whole number of at least 2"):
+        with pytest.raises(InputError, match=rf"{name}\(\): num_poses is {poses}; expected a whole number of at least 2"):
             path(poses)
     for bad in ((0, 0), (0, 0, np.nan), 3.0, (0, np.inf, 0)):
         with pytest.raises(InputError, match=rf"{name}\(\): start is .*expected three finite numbers"):

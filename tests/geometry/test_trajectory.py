@@ -84,7 +84,7 @@ def test_resampling_with_poses_at_one_place():
 
 
 def test_resampling_refuses_one_pose():
-    with pytest.raises(InputError, match=r"resample\(\): poses is 1"):
+    with pytest.raises(InputError, match=r"resample\(\): num_poses is 1"):
         resample(line(), 1)
 
 
