@@ -21,7 +21,7 @@ from tdf_jax.viz.training import training_figure
 NETWORK = NetworkConfig(latent=16, vector_hidden=16, vector_width=32, decoder_width=16, blocks=1)
 CONFIG = TrainConfig(
     seed=3,
-    steps=40,
+    steps=8,
     batch=2,
     points=32,
     queries=64,
@@ -29,10 +29,11 @@ CONFIG = TrainConfig(
     poses=3,
     learning_rate=0.02,
     warmup=2,
-    validate_every=20,
+    validate_every=4,
     save_seconds=0.0,
     network=NETWORK,
 )
+LONG = dataclasses.replace(CONFIG, steps=40, validate_every=20)  # enough to learn something
 
 
 def built(folder, category="mug", objects=2):
@@ -63,6 +64,8 @@ def train(sets, quick_compilation):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "_optimiser", functools.cache(loop._optimiser))
         patch.setattr(loop, "TRANSFER", OptimizeConfig(inits=2, iterations=2))
+        patch.setattr(loop, "VALIDATION_BOX", 8)
+        patch.setattr(loop, "VALIDATION_POSES", 5)
         patch.setattr("tdf_jax.training.batch.SPARSE_CLOUDS", (40, 300))
         # half a metre is too much for so small a network
         patch.setattr("tdf_jax.training.batch.DIAGONALS", (0.12, 0.25))
@@ -78,20 +81,32 @@ def whole(train, tmp_path_factory):
     return folder, train(CONFIG, folder)
 
 
+@pytest.fixture(scope="module")
+def long(train, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("long")
+    return folder, train(LONG, folder)
+
+
 def metrics(directory):
     rows = [json.loads(line) for line in (directory / "metrics.jsonl").read_text().splitlines()]
     return [{name: value for name, value in row.items() if name != "seconds"} for row in rows]
 
 
 @pytest.mark.slow
-def test_training_lowers_the_loss(whole):
-    folder, params = whole
-    rows = metrics(folder)
+def test_training_lowers_the_loss(long):
+    rows = metrics(long[0])
     assert [row["step"] for row in rows] == list(range(1, 41))
     losses = [row["bce"] + row["frame"] for row in rows]
     # By the half of the run: partial clouds, which grow from then on, are too much for a network this small.
     assert np.mean(losses[14:19]) < 0.8 * np.mean(losses[:4])
-    assert [row["step"] for row in rows if "validation" in row] == [20, 40]
+
+
+def test_every_step_is_told_and_some_are_validated(whole):
+    folder, params = whole
+    rows = metrics(folder)
+    assert [row["step"] for row in rows] == list(range(1, 9))
+    assert rows[-1]["frame"] < rows[0]["frame"]
+    assert [row["step"] for row in rows if "validation" in row] == [4, 8]
     for name in ("validation", "one_view"):
         assert set(rows[-1][name]) == {"loss", "bce", "frame", "place", "iou"}
     assert rows[-1]["validation"] != rows[-1]["one_view"]
@@ -152,7 +167,7 @@ def test_a_network_of_two_data_sets_trains_and_resumes_to_the_same_numbers(train
     """Killed at its fifth step and begun again; validation is on pairs of mugs and pairs of bowls, never of both."""
     params = train(CONFIG, tmp_path / "whole", data=two_sets)
     rows = metrics(tmp_path / "whole")
-    assert [row["step"] for row in rows if "validation" in row] == [20, 40]
+    assert [row["step"] for row in rows if "validation" in row] == [4, 8]
     assert set(rows[-1]["validation"]) == {"loss", "bce", "frame", "place", "iou"}
     assert set(rows[-1]["transfer"]) == {"position_cm", "rotation_deg", "success"}
     save, kill = loop.save, [5]
@@ -220,12 +235,12 @@ def test_metrics_cut_short_anywhere_are_dropped(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_run_may_go_on_from_weights(train, whole, tmp_path):
+def test_a_run_may_go_on_from_weights(train, long, tmp_path):
     """It starts where the weights left off, with its frame read out again, not from the beginning."""
-    before = jax.tree.map(np.array, whole[1])
-    train(dataclasses.replace(CONFIG, steps=4, corruption=0.0), tmp_path, initial=whole[1])
-    assert_same(whole[1], before)  # still there, and as they were
-    first, fresh = metrics(tmp_path)[0], metrics(whole[0])[0]  # of the same objects
+    before = jax.tree.map(np.array, long[1])
+    train(dataclasses.replace(LONG, steps=4, corruption=0.0), tmp_path, initial=long[1])
+    assert_same(long[1], before)  # still there, and as they were
+    first, fresh = metrics(tmp_path)[0], metrics(long[0])[0]  # of the same objects
     # 40 steps of so small a network amplify rounding: with sums in another order the first ratio was 0.98 instead of
     # 0.94, the second 0.004 for 0.04.
     assert first["bce"] < fresh["bce"]
@@ -257,8 +272,17 @@ def test_minutes_become_steps(sets, monkeypatch):
         loop.steps_within(0.01, CONFIG, sets[0])
 
 
-def test_curves_show_training_and_both_validations(whole):
-    rows = run_folder.metrics(whole[0])
+def test_curves_show_training_and_both_validations():
+    """Of canned rows: 40 steps, each tenth validated."""
+    rng = np.random.default_rng(0)
+
+    def numbers(*names):
+        return dict(zip(names, rng.uniform(0.1, 1, len(names)).tolist(), strict=True))
+
+    rows = [{"step": step, **numbers("bce", "iou", "frame", "place")} for step in range(1, 41)]
+    for row in rows[19::20]:
+        row |= {name: numbers("bce", "iou", "frame", "place") for name in ("validation", "one_view")}
+        row["transfer"] = numbers("success")
     panels = training_figure(rows).axes
     assert len(panels) == 4
     for panel, name in zip(panels, ("bce", "iou", "frame", "place")):
