@@ -21,10 +21,11 @@ def traced(*values) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
-def count(function: str, name: str, value, least: int = 1) -> int:
-    """A whole number of at least `least`."""
-    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
-        raise InputError(f"{function}: {name} is {value!r}; expected a whole number of at least {least}")
+def count(function: str, name: str, value, least: int = 1, most: float = np.inf) -> int:
+    """A whole number of at least `least`, and at most `most`."""
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or not least <= value <= most:
+        expected = f"of at least {least}" if most == np.inf else f"from {least} to {most}"
+        raise InputError(f"{function}: {name} is {value!r}; expected a whole number {expected}")
     return int(value)
 
 
@@ -57,11 +58,38 @@ def choice(function: str, name: str, value, choices: Collection[str]) -> str:
 
 def vector(function: str, name: str, value: ArrayLike, size: int = 3, unit: str = "metres") -> np.ndarray | jax.Array:
     """`size` finite numbers, as float64 unless they are traced."""
-    words = {3: "three", 4: "four", 7: "seven"}.get(size, str(size))
-    vector = value if traced(value) else _array(function, name, value)
+    vector = jax.numpy.asarray(value) if traced(value) else _array(function, name, value)
     if vector.shape != (size,) or not (traced(vector) or np.isfinite(vector).all()):
-        raise InputError(f"{function}: {name} is {value}; expected {words} finite numbers{unit and ', ' + unit}")
+        raise InputError(
+            f"{function}: {name} is {value}; expected {_in_words(size)} finite numbers{unit and ', ' + unit}"
+        )
     return vector
+
+
+def direction(function: str, name: str, value: ArrayLike) -> np.ndarray | jax.Array:
+    """Three finite numbers that are not all zero, of any length; as float64 unless they are traced."""
+    direction = vector(function, name, value, unit="")
+    if not traced(direction) and not direction.any():
+        raise InputError(f"{function}: {name} is zero; expected a direction, three numbers that are not all zero")
+    return direction
+
+
+def lengths(function: str, name: str, value: ArrayLike, size: int = 3) -> np.ndarray | jax.Array:
+    """`size` finite numbers above 0, metres, as float64 unless they are traced."""
+    lengths = jax.numpy.asarray(value) if traced(value) else _array(function, name, value)
+    if lengths.shape != (size,) or not (traced(lengths) or (np.isfinite(lengths) & (lengths > 0)).all()):
+        raise InputError(f"{function}: {name} is {value}; expected {_in_words(size)} lengths above 0, metres")
+    return lengths
+
+
+def coordinates(function: str, name: str, value: ArrayLike, rows: str = "points") -> np.ndarray | jax.Array:
+    """Points in space, (rows, 3), at least one, finite; as an array of the caller's type."""
+    array = value if traced(value) else np.asarray(value)
+    if array.ndim != 2 or array.shape[1] != 3 or not len(array) or array.dtype.kind not in "fiu":
+        raise InputError(f"{function}: {name} has shape {array.shape}; expected numbers ({rows}, 3), metres")
+    if not traced(array) and not np.isfinite(array).all():
+        raise InputError(f"{function}: {name} has NaN or infinite coordinates; expected finite metres")
+    return array
 
 
 def pose(function: str, name: str, value: ArrayLike) -> ArrayLike:
@@ -86,6 +114,18 @@ def rotations(function: str, name: str, value: ArrayLike) -> ArrayLike:
         if not (np.allclose(R @ np.swapaxes(R, -1, -2), np.eye(3), atol=1e-3) and (np.linalg.det(R) > 0).all()):
             raise InputError(f"{function}: {name} is not orthonormal with determinant 1, or not finite")
     return value
+
+
+def orientation(function: str, name: str, value: ArrayLike) -> np.ndarray | jax.Array:
+    """One rotation, as a matrix (3, 3) or a quaternion wxyz (4,) that is not zero; as float64 unless it is traced."""
+    orientation = jax.numpy.asarray(value) if traced(value) else _array(function, name, value)
+    if orientation.shape not in {(3, 3), (4,)}:
+        raise InputError(f"{function}: {name} has shape {orientation.shape}; expected (3, 3), or (4,) as wxyz")
+    if orientation.shape == (3, 3):
+        rotations(function, name, orientation)
+    elif not traced(orientation) and not (np.isfinite(orientation).all() and orientation.any()):
+        raise InputError(f"{function}: {name} wxyz is {value}; expected a finite quaternion that is not zero")
+    return orientation
 
 
 def key(function: str, value) -> jax.Array:
@@ -155,6 +195,10 @@ def query(function: str, value) -> ArrayLike:
     if not traced(value) and not np.isfinite(np.asarray(value)).all():
         raise InputError(f"{function}: some query points are NaN or infinite; expected finite metres")
     return value
+
+
+def _in_words(size: int) -> str:
+    return {3: "three", 4: "four", 7: "seven"}.get(size, str(size))
 
 
 def _is_number(value) -> bool:

@@ -1,4 +1,6 @@
-"""A number is not a key: every function that draws says so, and takes both kinds of jax's keys."""
+"""Validators: good values pass, bad ones are refused with one message, and traced values are judged by their shapes."""
+
+from functools import partial
 
 import jax
 import numpy as np
@@ -33,3 +35,69 @@ def test_functions_that_draw_check_their_key(small_model, demonstration, field, 
     for name, call in calls.items():
         with pytest.raises(InputError, match=rf"^{name}\(\): key is 0"):
             call()
+
+
+# Numbers of traced values are not known yet: only their shapes are checked
+
+
+def wxyz_xyz(*shape):
+    return np.broadcast_to(np.float32([1, 0, 0, 0, 0.1, 0.2, 0.3]), (*shape, 7))
+
+
+CLOUD = np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32)
+# validator, a good value, bad numbers in its shape, bad shapes
+VALIDATORS = {
+    "number": (partial(checks.number, "f()", "x", least=0, most=1), 0.5, (np.nan, -1.0, 2.0), (np.ones(2),)),
+    "positive": (partial(checks.positive, "f()", "x"), 0.5, (np.inf, 0.0), (np.ones((1, 1)),)),
+    "vector": (partial(checks.vector, "f()", "x"), np.ones(3), ([0, np.nan, 0],), (np.ones(2), np.ones((1, 3)))),
+    "direction": (partial(checks.direction, "f()", "x"), np.ones(3), (np.zeros(3), [np.inf, 0, 0]), (np.ones(4),)),
+    "lengths": (partial(checks.lengths, "f()", "x"), np.ones(3), ([1, 0, 1], [1, 1, np.nan]), (np.ones(2), 1.0)),
+    "coordinates": (partial(checks.coordinates, "f()", "x"), CLOUD, (CLOUD * np.nan,), (CLOUD[:, :2], CLOUD[:0])),
+    "pose": (partial(checks.pose, "f()", "x"), wxyz_xyz(), (np.zeros(7), wxyz_xyz() + np.inf), (wxyz_xyz(1),)),
+    "rotations": (partial(checks.rotations, "f()", "x"), np.eye(3), (np.ones((3, 3)), -np.eye(3)), (np.eye(4),)),
+    "orientation": (partial(checks.orientation, "f()", "x"), np.eye(3), (np.ones((3, 3)),), (np.eye(2), np.ones(3))),
+    "quaternion": (partial(checks.orientation, "f()", "x"), np.ones(4), (np.zeros(4), [np.nan] * 4), (np.ones(5),)),
+    "points": (partial(checks.points, "f()", name="x"), CLOUD, (CLOUD * np.nan, CLOUD * 0), (CLOUD[:20], CLOUD[:, 0])),
+    "query": (partial(checks.query, "f()"), CLOUD, (CLOUD * np.inf,), (CLOUD[0], CLOUD[:0])),
+}
+
+
+@pytest.mark.parametrize("name", VALIDATORS)
+def test_bad_numbers_and_bad_shapes_are_refused(name):
+    check, good, bad_numbers, bad_shapes = VALIDATORS[name]
+    np.testing.assert_array_equal(check(good), good)
+    for bad in (*bad_numbers, *bad_shapes):
+        with pytest.raises(InputError, match=r"^f\(\): .*(x|query points)\b"):
+            check(bad)
+
+
+@pytest.mark.parametrize("name", VALIDATORS)
+def test_traced_values_pass_whatever_their_numbers_and_are_refused_by_their_shapes(name):
+    check, good, bad_numbers, bad_shapes = VALIDATORS[name]
+    for value in (good, *bad_numbers):
+        value = np.asarray(value, np.float32)
+        with jax.debug_nans(False):
+            np.testing.assert_array_equal(jax.jit(check)(value), value)
+            np.testing.assert_array_equal(jax.vmap(check)(np.stack([value, value])), [value, value])
+    for bad in bad_shapes:
+        for transformed in (jax.jit(check), lambda value: jax.vmap(check)(value[None])):
+            with pytest.raises(InputError, match=r"^f\(\): .*(x|query points)\b"):
+                transformed(np.asarray(bad, np.float32))
+
+
+def test_traced_numbers_in_a_list_make_a_vector():
+    np.testing.assert_array_equal(jax.jit(lambda x: checks.vector("f()", "x", [0.0, x, 1.0]))(2.0), [0, 2, 1])
+
+
+@pytest.mark.parametrize("value", [0, 6, 1.5, True, "2", None])
+def test_counts_are_whole_numbers_within_bounds(value):
+    assert checks.count("f()", "x", np.int32(5), most=5) == 5
+    with pytest.raises(InputError, match=r"^f\(\): x is .*; expected a whole number from 1 to 5$"):
+        checks.count("f()", "x", value, most=5)
+
+
+def test_choices_are_listed():
+    assert checks.choice("f()", "x", "b", ("a", "b")) == "b"
+    for bad in ("c", 1, None):
+        with pytest.raises(InputError, match=r"^f\(\): x is .*; expected one of a, b$"):
+            checks.choice("f()", "x", bad, ("a", "b"))
