@@ -1,10 +1,13 @@
-"""Links between the pages of the documentation."""
+"""Links, options and modules that the documentation names."""
 
+import importlib.util
 import json
 import re
 from pathlib import Path
 
 import pytest
+
+from tdf_jax.cli.main import COMMANDS, main
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted(
@@ -50,3 +53,27 @@ def test_every_picture_and_page_is_linked():
     }
     files = {path for path in (ROOT / "docs").rglob("*") if path.suffix in {".md", ".png"}}
     assert files - linked - {ROOT / "docs" / "training.md"} == set()
+
+
+COMMAND = re.compile(r"\btdf (\w+)((?: [^`\n#]*)?)")
+WRITTEN = [page for page in PAGES if page.parent.name not in {"weights", "notebooks", "benchmark", "benchmark_views1"}]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_options_in_the_documentation_exist(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    known = set(re.findall(r"--[\w.-]+", capsys.readouterr().out))
+    for page in WRITTEN:
+        for name, rest in COMMAND.findall(text(page)):
+            if name == command:
+                options = set(re.findall(r"(?<=\s)--[a-z][\w.-]*", rest))
+                assert options <= known, f"{page.relative_to(ROOT)}: {sorted(options - known)}"
+
+
+def test_modules_run_by_the_documentation_exist():
+    ours = re.compile(r"python -m ((?:tdf_jax|bench)[\w.]*)")
+    for page in WRITTEN:
+        for module in ours.findall(text(page)):
+            assert importlib.util.find_spec(module), f"{page.relative_to(ROOT)}: {module}"
