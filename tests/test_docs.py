@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
+from test_layout import MAY_IMPORT
 
 from tdf_jax.cli.main import COMMANDS, main
 
@@ -77,3 +78,9 @@ def test_modules_run_by_the_documentation_exist():
     for page in WRITTEN:
         for module in ours.findall(text(page)):
             assert importlib.util.find_spec(module), f"{page.relative_to(ROOT)}: {module}"
+
+
+def test_the_contributing_guide_has_the_table_of_imports():
+    rows = re.findall(r"^\| `(\w+)` \| [^|]+ \| ([^|]+) \|$", (ROOT / "CONTRIBUTING.md").read_text(), re.MULTILINE)
+    listed = {name: tuple(re.findall(r"`(\w+)`", imports)) for name, imports in rows}
+    assert listed == {name: tuple(imports) for name, imports in MAY_IMPORT.items()}
