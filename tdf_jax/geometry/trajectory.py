@@ -1,4 +1,4 @@
-"""Trajectories of a query frame: resampling, displacing, checks, files."""
+"""Trajectories of a query frame: checked, moved, resampled and displaced."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.deprecation import renamed_keywords, warn
@@ -17,13 +18,13 @@ from tdf_jax.geometry import se3
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses of the query frame in the world, from the pick (index 0) to the place (the last).
+    """Poses of the query frame in the world, from the pick (index 0) to the place (the last index).
 
-    A pytree of one array, so `jax.vmap` and `jax.grad` go through it. `T_world_query[i]` is pose i:
+    A trajectory is a pytree of one array, so `jax.vmap` and `jax.grad` accept it. `T_world_query[i]` is pose i:
     x_world = R_i x_query + t_i.
 
     Attributes:
-        wxyz_xyz: Poses, quaternion then translation in metres: the layout of `jaxlie.SE3`.
+        wxyz_xyz: poses, (poses, 7), quaternion then translation in metres, world frame: the layout of `jaxlie.SE3`.
     """
 
     wxyz_xyz: Float[Array, "poses 7"]
@@ -41,124 +42,144 @@ class Trajectory:
 
     @property
     def rotations(self) -> Float[Array, "poses 3 3"]:
-        """Rotation matrices."""
+        """Rotation matrices, (poses, 3, 3)."""
         return se3.rotation(self.wxyz_xyz)
 
     @property
     def translations(self) -> Float[Array, "poses 3"]:
-        """Translations, metres."""
+        """Translations, (poses, 3), metres, world frame."""
         return se3.translation(self.wxyz_xyz)
 
     @property
     def matrices(self) -> Float[Array, "poses 4 4"]:
-        """Homogeneous matrices."""
+        """Homogeneous matrices, (poses, 4, 4)."""
         upper = jnp.concatenate([self.rotations, self.translations[..., None]], axis=-1)
         lower = jnp.broadcast_to(jnp.array([0, 0, 0, 1], upper.dtype), (*upper.shape[:-2], 1, 4))
         return jnp.concatenate([upper, lower], axis=-2)
 
     @classmethod
     def from_matrices(cls, T_world_query: Float[Array, "poses 4 4"]) -> "Trajectory":
-        """Trajectory of homogeneous matrices.
+        """Make a trajectory of homogeneous matrices.
 
         Args:
-            T_world_query: Rigid transforms, metres.
+            T_world_query: rigid transforms, (poses, 4, 4), metres, world frame.
 
         Returns:
             The trajectory.
 
         Raises:
-            InputError: If the shape is wrong, there are fewer than 2, or one is not rigid or not finite.
+            InputError: the shape is wrong, or a matrix is not rigid or not finite.
         """
         T = jnp.asarray(T_world_query)
         if T.ndim != 3 or T.shape[1:] != (4, 4):
-            raise InputError(f"Trajectory.from_matrices(): matrices have shape {T.shape}; expected (poses, 4, 4).")
-        if not isinstance(T, jax.core.Tracer):
+            raise InputError(f"Trajectory.from_matrices(): matrices have shape {T.shape}; expected (poses, 4, 4)")
+        if not checks.traced(T):
             if not np.isfinite(T).all():
-                raise InputError("Trajectory.from_matrices(): a matrix is NaN or infinite; expected rigid transforms.")
+                raise InputError("Trajectory.from_matrices(): a matrix is NaN or infinite; expected rigid transforms")
             checks.rotations("Trajectory.from_matrices()", "T_world_query", T[:, :3, :3])
             if not np.allclose(T[:, 3], [0, 0, 0, 1], atol=1e-6):
-                raise InputError("Trajectory.from_matrices(): the last row of a matrix is not 0 0 0 1, as expected.")
+                raise InputError(
+                    "Trajectory.from_matrices(): the last row of a matrix differs from the expected 0 0 0 1; "
+                    "transpose matrices that act on row vectors"
+                )
         return check_trajectory(cls(se3.pose(T[:, :3, :3], T[:, :3, 3])))
 
     def transformed(self, T_new_world: Float[Array, "7"]) -> "Trajectory":
-        """The trajectory carried by a rigid motion of the world: T_new_query = T_new_world T_world_query.
+        """Apply a rigid transform of the world: T_new_query = T_new_world T_world_query.
 
         Args:
-            T_new_world: Pose `wxyz_xyz`.
+            T_new_world: pose `wxyz_xyz` of the world in the new frame, (7,), metres.
 
         Returns:
             The trajectory in the new frame.
         """
         return Trajectory(se3.compose(jnp.asarray(T_new_world), self.wxyz_xyz))
 
-    def shifted(self, offset: Float[Array, "3"]) -> "Trajectory":
-        """The trajectory with a vector, metres, added to every translation."""
+    def shifted(self, offset: ArrayLike) -> "Trajectory":
+        """Add a vector to every translation.
+
+        Args:
+            offset: vector to add, (3,), metres, world frame.
+
+        Returns:
+            The shifted trajectory.
+        """
         return Trajectory(jnp.concatenate([self.wxyz_xyz[..., :4], self.translations + jnp.asarray(offset)], axis=-1))
 
-    def displaced(self, offset: Float[Array, "3"], where: Literal["start", "goal"] = "goal") -> "Trajectory":
-        """The trajectory with one end moved; see `displace`."""
+    def displaced(self, offset: ArrayLike, where: Literal["start", "goal"] = "goal") -> "Trajectory":
+        """Displace one end of the trajectory, as `displace` does.
+
+        Args:
+            offset: vector to add to the translation of that end, (3,), metres, world frame.
+            where: end to displace, "goal" (the last pose) or "start" (the first pose).
+
+        Returns:
+            The displaced trajectory.
+        """
         return displace(self, offset, where)
 
 
 def check_trajectory(trajectory: Trajectory, name: str = "trajectory") -> Trajectory:
     """Check that a trajectory can be used; nothing is changed.
 
-    Under `jax.jit` only the shape is checked: the values are not known yet.
+    Only the shape and the type of traced poses are checked, because their values are not known yet.
 
     Args:
-        trajectory: The trajectory.
-        name: What the message calls it.
+        trajectory: trajectory to check.
+        name: name of the trajectory in error messages.
 
     Returns:
         The same trajectory.
 
     Raises:
-        InputError: If the shape is not (poses, 7) with at least one pose, a number is not finite, or a quaternion
-            has length zero.
+        InputError: the shape is not (poses, 7) with at least one pose, a number is not finite, or a quaternion has
+            length zero.
     """
     wxyz_xyz = trajectory.wxyz_xyz
     if not isinstance(wxyz_xyz, jax.Array | np.ndarray):
-        raise InputError(f"check_trajectory(): {name}.wxyz_xyz is a {type(wxyz_xyz).__name__}; expected an array.")
+        raise InputError(f"check_trajectory(): {name}.wxyz_xyz is a {type(wxyz_xyz).__name__}; expected an array")
     if wxyz_xyz.ndim != 2 or wxyz_xyz.shape[1] != 7:
-        raise InputError(f"check_trajectory(): {name}.wxyz_xyz has shape {wxyz_xyz.shape}; expected (poses, 7).")
+        raise InputError(f"check_trajectory(): {name}.wxyz_xyz has shape {wxyz_xyz.shape}; expected (poses, 7)")
     if not jnp.issubdtype(wxyz_xyz.dtype, jnp.floating):
-        raise InputError(f"check_trajectory(): {name} has dtype {wxyz_xyz.dtype}; expected floating point.")
+        raise InputError(f"check_trajectory(): {name} has dtype {wxyz_xyz.dtype}; expected floating point")
     if not len(wxyz_xyz):
-        raise InputError(f"check_trajectory(): {name} has no pose; expected at least one.")
-    if not isinstance(wxyz_xyz, jax.core.Tracer):
+        raise InputError(f"check_trajectory(): {name} has no pose; expected at least one")
+    if not checks.traced(wxyz_xyz):
         values = np.asarray(wxyz_xyz)
         finite = np.isfinite(values).all(axis=1)
         if not finite.all():
-            raise InputError(f"check_trajectory(): pose {np.argmin(finite)} of {name} is NaN or infinite.")
-        lengths = np.linalg.norm(values[:, :4], axis=1)
-        if not (lengths > 1e-6).all():
             raise InputError(
-                f"check_trajectory(): the quaternion of pose {np.argmin(lengths)} of {name} has length "
-                f"{lengths.min():.1e}; expected w x y z of a rotation, length 1."
+                f"check_trajectory(): pose {np.argmin(finite)} of {name} is NaN or infinite; expected finite poses"
+            )
+        norms = np.linalg.norm(values[:, :4], axis=1)
+        if not (norms > 1e-6).all():
+            raise InputError(
+                f"check_trajectory(): the quaternion of pose {np.argmin(norms)} of {name} has length "
+                f"{norms.min():.1e}; expected w x y z of a rotation, length 1"
             )
     return trajectory
 
 
 @renamed_keywords(poses="num_poses")
 def resample(trajectory: Trajectory, num_poses: int) -> Trajectory:
-    """The same path with another number of poses, evenly spaced by the length of the translations' polyline.
+    """Resample a path to another number of poses, evenly spaced by the length of the translations' polyline.
 
-    Rotations turn evenly (slerp) between the poses of the original. A path that stays in one place is spaced by
-    its poses instead.
+    Rotations follow the SO(3) geodesic (slerp) between the original poses. The poses of a path without any translation
+    are spaced by their index instead.
 
     Args:
-        trajectory: The trajectory.
-        num_poses: New number of poses, at least 2.
+        trajectory: trajectory to resample, at least 2 poses.
+        num_poses: new number of poses, at least 2.
 
     Returns:
-        The resampled trajectory; its ends are those of the original.
+        The resampled trajectory, with the ends of the original.
 
     Raises:
-        InputError: If num_poses is below 2, the trajectory has one pose, or it fails `check_trajectory`.
+        InputError: num_poses is below 2, the trajectory has one pose, or it fails `check_trajectory`.
     """
     checks.count("resample()", "num_poses", num_poses, least=2)
     if check_trajectory(trajectory).num_poses < 2:
-        raise InputError("resample(): the trajectory has one pose; expected at least 2, a way between.")
+        raise InputError("resample(): the trajectory has one pose; expected at least 2, a path between them")
     R, t = trajectory.rotations, trajectory.translations
     steps = jnp.linalg.norm(jnp.diff(t, axis=0), axis=1)
     steps = jnp.where(steps.sum() > 0, steps, 1.0)
@@ -170,22 +191,22 @@ def resample(trajectory: Trajectory, num_poses: int) -> Trajectory:
     return Trajectory(se3.pose(se3.geodesic(R[i], R[i + 1], fraction), translations))
 
 
-def displace(trajectory: Trajectory, offset: Float[Array, "3"], where: Literal["start", "goal"] = "goal") -> Trajectory:
-    """The trajectory with one end moved; the other poses stay (the displacements of the paper's table 1).
+def displace(trajectory: Trajectory, offset: ArrayLike, where: Literal["start", "goal"] = "goal") -> Trajectory:
+    """Displace one end of a trajectory; the other poses stay, as in the displacements of the paper's table 1.
 
     Args:
-        trajectory: The trajectory.
-        offset: World vector added to the translation, metres.
-        where: "goal" for the last pose, "start" for the first.
+        trajectory: trajectory to displace.
+        offset: vector to add to the translation of that end, (3,), metres, world frame.
+        where: end to displace, "goal" (the last pose) or "start" (the first pose).
 
     Returns:
         The displaced trajectory.
 
     Raises:
-        InputError: If where is unknown, the offset is not three numbers, or the trajectory fails `check_trajectory`.
+        InputError: `where` is unknown, the offset is not three finite numbers, or the trajectory fails
+            `check_trajectory`.
     """
-    if where not in ("start", "goal"):
-        raise InputError(f"displace(): where is {where!r}; expected 'start' or 'goal'.")
-    offset = checks.vector("displace()", "offset", offset)
+    checks.choice("displace()", "where", where, ("start", "goal"))
+    vector = checks.vector("displace()", "offset", offset)
     wxyz_xyz = jnp.asarray(check_trajectory(trajectory).wxyz_xyz)
-    return Trajectory(wxyz_xyz.at[0 if where == "start" else -1, 4:].add(jnp.asarray(offset, wxyz_xyz.dtype)))
+    return Trajectory(wxyz_xyz.at[0 if where == "start" else -1, 4:].add(jnp.asarray(vector, wxyz_xyz.dtype)))

@@ -73,7 +73,9 @@ def test_orientations_turn_evenly_from_one_to_the_other(path):
 def test_paths_refuse_bad_arguments(path):
     name = path.__name__
     for poses in (1, 0, -3, 2.5):
-        with pytest.raises(InputError, match=rf"{name}\(\): num_poses is {poses}; expected a whole number of at least 2"):
+        with pytest.raises(
+            InputError, match=rf"{name}\(\): num_poses is {poses}; expected a whole number of at least 2"
+        ):
             path(poses)
     for bad in ((0, 0), (0, 0, np.nan), 3.0, (0, np.inf, 0)):
         with pytest.raises(InputError, match=rf"{name}\(\): start is .*expected three finite numbers"):
@@ -89,7 +91,7 @@ def test_paths_refuse_bad_arguments(path):
             with pytest.raises(InputError, match="not orthonormal with determinant 1, or not finite"):
                 path(end_rotation=bad)
     for bad in (np.zeros(4), np.full(4, np.nan)):
-        with pytest.raises(InputError, match="expected a finite quaternion, not zero"):
+        with pytest.raises(InputError, match="expected a finite quaternion that is not zero"):
             path(rotation=bad)
     with pytest.raises(InputError, match=r"rotation has shape \(3,\)"):
         path(rotation=np.zeros(3))
@@ -98,7 +100,7 @@ def test_paths_refuse_bad_arguments(path):
 @pytest.mark.parametrize("path", [semicircle, wave])
 def test_curved_paths_refuse_bad_heights_and_bulges(path):
     for height in (0, -0.1, np.nan, np.inf, (1, 2)):
-        with pytest.raises(InputError, match="height is .*; expected metres above 0"):
+        with pytest.raises(InputError, match="height is .*; expected a positive number, metres; reverse bulge"):
             path(height=height)
     for bulge in ((0, 1, 0), (0, -2, 0), (0, 0, 0)):
         with pytest.raises(InputError, match="is zero or along the chord"):
@@ -157,15 +159,17 @@ def test_hanging_ends_straight_and_without_a_turn():
 def test_lifts_pours_and_racks_refuse_what_has_no_meaning():
     for height in (0, -0.1, np.nan, (1, 2)):
         for path in (lift_over, tilt_and_pour):
-            with pytest.raises(InputError, match=rf"{path.__name__}\(\): height is .*; expected one number above 0"):
+            with pytest.raises(
+                InputError, match=rf"{path.__name__}\(\): height is .*; expected a positive number, metres"
+            ):
                 path(height=height)
     with pytest.raises(InputError, match=r"lift_over\(\): up is zero"):
         lift_over(up=(0, 0, 0))
-    with pytest.raises(InputError, match="along the way from start to end"):
+    with pytest.raises(InputError, match="along the line from start to end"):
         tilt_and_pour(up=(0, -2, 0))
     for tilt in (0, np.pi, 90):
         with pytest.raises(InputError, match=rf"tilt_and_pour\(\): tilt is {tilt}"):
             tilt_and_pour(tilt=tilt)
     for approach in ((0, 0, 0), (0, 0.3, 0)):
-        with pytest.raises(InputError, match=r"hang_on_rack\(\): approach is .*not the whole way"):
+        with pytest.raises(InputError, match=r"hang_on_rack\(\): approach is .*not the whole vector"):
             hang_on_rack(approach=approach)

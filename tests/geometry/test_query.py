@@ -101,7 +101,9 @@ def test_lengths_are_above_zero(bad):
         (lambda: gripper_query(KEY, finger=(0.02, 0.01, bad)), "finger"),
         (lambda: lattice_query(pitch=bad), "pitch"),
     ]:
-        with pytest.raises(InputError, match=rf"{name} is .*; expected .*above 0, metres"):
+        with pytest.raises(
+            InputError, match=rf"{name} is .*; expected (a positive number|three lengths above 0), metres"
+        ):
             call()
 
 
@@ -112,7 +114,7 @@ def test_sizes_of_wrong_shape_are_refused():
         lambda: gripper_query(KEY, finger=0.1),
         lambda: gaussian_query(KEY, sigma=(0.1, 0.1, 0.1)),
     ):
-        with pytest.raises(InputError, match="above 0, metres"):
+        with pytest.raises(InputError, match="expected (a positive number|three lengths above 0), metres"):
             call()
     for shape in ((6, 6), (6, 6, 0), (6, 6, 1.5), 6):
         with pytest.raises(InputError, match="shape is .*; expected three whole numbers of at least 1"):
@@ -134,3 +136,10 @@ def test_snapping_to_no_lattice_is_refused():
         snapped_query(np.zeros((2, 3)), 0.0)
     with pytest.raises(InputError, match=r"shape \(3,\)"):
         snapped_query(np.zeros(3), 0.01)
+
+
+def test_traced_arguments_are_taken():
+    def points(size, centre):
+        return snapped_query(box_query(KEY, 5, size, centre), 0.01) + gaussian_query(KEY, 5, size, centre)
+
+    np.testing.assert_allclose(jax.jit(points)(0.1, np.ones(3)), points(0.1, np.ones(3)), atol=1e-6)

@@ -105,7 +105,7 @@ def test_displacing_moves_the_goal_by_default_and_can_be_traced():
 
 
 def test_displacing_refuses_bad_arguments():
-    with pytest.raises(InputError, match="where is 'end'; expected 'start' or 'goal'"):
+    with pytest.raises(InputError, match="where is 'end'; expected one of start, goal"):
         displace(line(), (0, 0, 1), "end")
     for offset in ((0, 1), np.zeros((7, 3)), (0, 0, np.nan)):
         with pytest.raises(InputError, match=r"(?s)displace\(\): offset is .*; expected three finite numbers"):
