@@ -1,10 +1,11 @@
 """What every package uses and no user imports.
 
 Modules:
+    cache: results kept by digest
     checks: validators of arguments
     deprecation: names of the release before
     devices: work shared among devices
     errors: the exception of a user's mistake, and warnings
-    files: atomic writes; results kept between runs
+    files: atomic writes
     precision: full float32 products on every device
 """

@@ -1,16 +1,11 @@
-"""Writing whole: a file or a folder appears under its name only once it is complete; what took long to compute is kept."""
+"""Atomic writes: a file or a folder appears under its name only once it is complete."""
 
 import contextlib
-import hashlib
-import json
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
-
-import numpy as np
-from numpy.typing import ArrayLike
+from typing import BinaryIO
 
 from tdf_jax._internal.errors import InputError
 
@@ -19,9 +14,9 @@ def replace_file(function: str, path: str | os.PathLike, content: bytes | Callab
     """Write a file under a temporary name beside it, then rename it into place.
 
     Args:
-        function: who writes, for the message.
-        path: the file, in an existing folder; replaced if it exists.
-        content: its bytes, or a function that writes them to an open file.
+        function: name that error messages begin with.
+        path: file to write, in an existing folder; an existing file is replaced.
+        content: bytes of the file, or a function that writes them to an open file.
 
     Raises:
         InputError: the file cannot be written.
@@ -44,54 +39,23 @@ def replace_file(function: str, path: str | os.PathLike, content: bytes | Callab
             temporary.unlink()
 
 
-def kept(
-    function: str,
-    folder: Path,
-    about: Any,
-    compute: Callable[[], Mapping[str, ArrayLike]],
-    build: Callable[[dict[str, np.ndarray]], Any] = dict,
-) -> Any:
-    """What is made of arrays from a folder of such, or computed and put there.
-
-    Args:
-        function: who asks, for the message.
-        folder: receives one .npz; it exists.
-        about: all that the arrays depend on, as JSON has it; the file's name is its digest.
-        compute: makes them where they are missing.
-        build: of the arrays by name, what is returned.
-
-    Raises:
-        InputError: the file cannot be written, is damaged, or holds something else.
-    """
-    digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
-    path = folder / f"{digest[:20]}.npz"
-    if not path.exists():
-        arrays = dict(compute())
-        replace_file(function, path, lambda file: np.savez(file, **arrays))
-        return build({name: np.asarray(array) for name, array in arrays.items()})
-    try:
-        with path.open("rb") as opened, np.load(opened) as file:
-            return build(dict(file))
-    except Exception as error:  # damaged files raise whatever their parser stumbles on
-        raise InputError(f"{function}: {path} cannot be read ({error}); delete it: it is computed again") from None
-
-
 @contextlib.contextmanager
 def replace_folder(function: str, path: str | os.PathLike, mark: str, names: Collection[str]) -> Iterator[Path]:
-    """A folder to fill, which gets its name only if the block ends without an exception; else nothing is left.
+    """Fill a folder that gets its name only if the block ends without an exception; otherwise it is removed.
 
     Args:
-        function: who writes, for the message.
-        path: the folder, in an existing one. One that exists is replaced as a whole, if it is empty or was written
-            before: it holds `mark` and nothing but `names`.
-        mark: the file by which an earlier folder is known.
-        names: all files that may be in one.
+        function: name that error messages begin with.
+        path: folder to write, in an existing one. An existing folder is replaced as a whole if it is empty or an
+            earlier result: it holds `mark` and nothing but `names`.
+        mark: file that identifies an earlier result.
+        names: all files that a result may hold.
 
     Yields:
         A new, empty folder beside `path`.
 
     Raises:
-        InputError: the folder cannot be made or must not be replaced (before the block), or not be written (after it).
+        InputError: before the block, the folder cannot be made or must not be replaced; after it, the folder cannot be
+            written.
     """
     target = Path(path).resolve()
     _check_replaceable(function, target, mark, names)

@@ -1,4 +1,4 @@
-"""Products of float32 numbers as float32 products, on every device."""
+"""Full float32 precision of products, on every device."""
 
 import functools
 
@@ -6,11 +6,11 @@ import jax
 
 
 def full_precision(function):
-    """`function`, traced so that float32 products are float32 products, unless the caller has set `jax.default_matmul_precision`.
+    """Decorator of a function that is traced with full float32 precision of products.
 
-    By default accelerators round their factors: an H200 to 10 bits, which put the latents of the parity test off by
-    1e-2, instead of the 1e-5 of a CPU. Rotations are multiplied exactly whatever the caller has set (`poses.multiply`):
-    rounded, they are none.
+    A `jax.default_matmul_precision` that the caller has set takes precedence. Accelerators round the factors of a
+    product by default, which parity with the original network does not survive (docs/results/code_notes.md). Rotations
+    are multiplied exactly whatever the caller has set (`se3.multiply`), because a rounded product is not a rotation.
     """
 
     @functools.wraps(function)

@@ -1,4 +1,4 @@
-"""`tdf convert`: a PyTorch NDF checkpoint -> weights that `--weights` and `load_model` take."""
+"""`tdf convert`: conversion of a PyTorch NDF checkpoint to weights for `--weights` and `load_model`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,8 +17,8 @@ def convert(
     """Convert a published Neural Descriptor Fields checkpoint; nothing in it is executed.
 
     Args:
-        source: the PyTorch file, `.pth`.
-        target: the file to write, `.safetensors`.
+        source: PyTorch file, `.pth`.
+        target: file to write, `.safetensors`.
     """
     model = convert_checkpoint(source)
     save_model(model, target)

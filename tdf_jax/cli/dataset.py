@@ -1,4 +1,4 @@
-"""`tdf dataset`: labelled objects to train on, generated or from a folder of meshes."""
+"""`tdf dataset`: labelled objects for training, generated or from a folder of meshes."""
 
 import os
 from pathlib import Path
@@ -15,12 +15,12 @@ def dataset(
     workers: Annotated[int, tyro.conf.arg(help_behavior_hint="(default: one for every core)")] = 0,
     recipe: Annotated[Recipe, tyro.conf.arg(name="")] = Recipe(),
 ) -> None:
-    """Label generated objects, or your own meshes, for `tdf train`; or go on where an interrupted call stood.
+    """Label generated objects, or your own meshes, for `tdf train`, or resume an interrupted call.
 
     Args:
         out: folder of the data set.
-        workers: processes.
-        recipe: what to build.
+        workers: number of processes.
+        recipe: settings of the data set.
     """
     if workers < 0:
         raise InputError(f"tdf dataset: --workers is {workers}; expected 1 or more, or 0 for one for every core")
@@ -30,7 +30,7 @@ def dataset(
         box, near = data.inside[:, data.uniform].mean(), data.inside[:, data.uniform.stop :].mean()
         seen = data.visible.mean()
         print(
-            f"{name}: {len(data.surface)} objects; inside: {box:.1%} of the uniform queries, {near:.1%} of those near the surface; "
-            f"a camera sees {seen:.0%} of a surface"
+            f"{name}: {len(data.surface)} objects; inside: {box:.1%} of the uniform queries, "
+            f"{near:.1%} of those near the surface; a camera sees {seen:.0%} of a surface"
         )
     print(f"saved {out}")

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import hashlib
 import json
 import math
 import shutil
@@ -15,6 +14,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
+from tdf_jax._internal.cache import digest
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file, replace_folder
 from tdf_jax.cli.options import LandscapeSettings, make_scene, resolved
@@ -154,11 +154,11 @@ def _query(settings, query):
 
 def _swept(settings, field: DescriptorField, reference: Reference, grid: Grid, rotations) -> Landscape:
     """The landscape, from where an interrupted sweep of the same stood."""
-    file, digest = _unfinished(settings), _digest(field, reference, grid, rotations)
+    file, about_now = _unfinished(settings), _digest(field, reference, grid, rotations)
     found, done = blank(field, reference, grid, rotations, settings.reduce), 0
     if file.exists():
         kept, about = load_landscape(file)
-        if about.get("digest") != digest:
+        if about.get("digest") != about_now:
             raise InputError(
                 f"tdf landscape: {file} is an unfinished sweep with other settings; expected the same ones to go on: give another --out, or "
                 "delete it"
@@ -174,10 +174,10 @@ def _swept(settings, field: DescriptorField, reference: Reference, grid: Grid, r
                 bar.total = total
                 bar.update(done - bar.n)
                 if time.monotonic() - saved > SAVE_SECONDS and done < total:
-                    save_landscape(file, found, {"digest": digest, "done": done})
+                    save_landscape(file, found, {"digest": about_now, "done": done})
                     saved = time.monotonic()
         finally:  # also when all is done: what comes next may fail or be interrupted
-            save_landscape(file, found, {"digest": digest, "done": done})
+            save_landscape(file, found, {"digest": about_now, "done": done})
     return found
 
 
@@ -192,8 +192,7 @@ def _digest(field, reference, grid, rotations) -> str:
     # Parts are counted by tiles, so these too.
     query = np.asarray(reference.query, dtype=float)
     tiles = [shared_lattice.tiles(grid, shared_lattice.layers(grid, query @ R.T).span) for R in rotations]
-    content = b"".join(np.ascontiguousarray(leaf).tobytes() for leaf in leaves) + repr(tiles).encode()
-    return hashlib.sha256(content).hexdigest()[:16]
+    return digest(*leaves, repr(tiles).encode())[:16]
 
 
 def _ends(grid, start, goal):

@@ -13,6 +13,15 @@ from tdf_jax._internal.errors import InputError
 MEMORY = "error: out of memory; lower the number of starts, poses, query points or points, or raise the pitch"
 # each is a function in the module of its name
 COMMANDS = ("imitate", "landscape", "convert", "evaluate", "benchmark", "shapes", "dataset", "train", "reproduce")
+# Options of the release before by command; they are accepted for one release, with a warning.
+DEPRECATED_FLAGS = {
+    "imitate": {"--inits": "--num-starts", "--poses": "--num-poses"},
+    "landscape": {"--poses": "--num-poses"},
+    "evaluate": {"--inits": "--num-starts", "--poses": "--num-poses"},
+    "benchmark": {"--inits": "--num-starts", "--poses": "--num-poses"},
+    "reproduce": {"--inits": "--num-starts", "--poses": "--num-poses", "--lever": "--rotation-scale"},
+    "train": {"--poses": "--num-poses", "--network.asymmetry": "--network.symmetry-breaking-offset"},
+}
 STYLE = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)  # `--json` without `--no-json`, no word for "not given"
 
 
@@ -31,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             commands,
             prog="tdf",
             description="Imitate a demonstrated pick-and-place trajectory on new objects.",
-            args=arguments,
+            args=_current(sys.argv[1:] if arguments is None else arguments),
             config=STYLE,
         )
         sys.stdout.flush()
@@ -47,6 +56,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _fail("interrupted", 130)
     except BrokenPipeError:  # `tdf imitate --json | head`: nobody reads on, and Python would complain again at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _current(arguments: Sequence[str]) -> list[str]:
+    """The arguments with today's names of options."""
+    new_names = DEPRECATED_FLAGS.get(arguments[0], {}) if arguments else {}
+    current = []
+    for word in arguments:
+        name, equals, value = word.partition("=")
+        if name in new_names:
+            print(f"tdf: warning: {name} is deprecated; use {new_names[name]}", file=sys.stderr)
+            name = new_names[name]
+        current.append(name + equals + value)
+    return current
 
 
 def _fail(message: str, code: int) -> None:

@@ -1,4 +1,4 @@
-"""`tdf shapes`: what generated objects look like, beside meshes of real ones."""
+"""`tdf shapes`: a picture of generated objects, beside meshes of real ones."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -16,14 +16,15 @@ def shapes(
     """Draw a contact sheet of generated objects, each with its symmetry.
 
     Args:
-        category: of the objects.
-        out: .png to write.
-        count: of generated objects.
-        seed: of their dimensions; training and evaluation draw others.
-        meshes: folder of real objects and their meshes.json, drawn after them; see docs/guide/evaluation.md.
+        category: category of the objects.
+        out: .png file to write.
+        count: number of generated objects.
+        seed: seed of their dimensions; training and evaluation draw others.
+        meshes: folder of real objects with a meshes.json, drawn after the generated ones; see docs/guide/evaluation.md.
     """
     import numpy as np
 
+    from tdf_jax._internal import checks
     from tdf_jax._internal.errors import InputError
     from tdf_jax.evaluation.annotated_meshes import load_annotated
     from tdf_jax.geometry.symmetry import FOLDS
@@ -31,8 +32,7 @@ def shapes(
     from tdf_jax.viz.contact_sheet import contact_sheet
     from tdf_jax.viz.style import save_figure
 
-    if count < 1:
-        raise InputError(f"tdf shapes: --count is {count}; expected at least 1")
+    checks.count("tdf shapes", "--count", count)
     if not 0 <= seed < 2**32:
         raise InputError(f"tdf shapes: --seed is {seed}; expected 0 to {2**32 - 1}")
     if out.suffix != ".png" or not out.parent.is_dir():

@@ -1,4 +1,4 @@
-"""`tdf train`: weights from labelled objects."""
+"""`tdf train`: training of a network on labelled objects."""
 
 import dataclasses
 import os
@@ -7,6 +7,7 @@ from typing import Annotated
 
 import tyro
 
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.networks.checkpoint import SUFFIX, load_model, save_model
 from tdf_jax.networks.model import Model, ModelInfo
@@ -35,23 +36,23 @@ def train(
     ] = 0,
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = TrainConfig(),
 ) -> None:
-    """Train a network on labelled objects, or go on where the run in a folder stands.
+    """Train a network on labelled objects, or resume the run in a folder.
 
     Args:
-        out: folder of the run: its settings, metrics, curves and checkpoint.
-        data: folder made by tdf dataset; several for one network of several categories.
-        start_from: a name of shipped weights or a .safetensors file to go on from, with their asymmetry unless
-            --network.asymmetry is another one than 0; --learning-rate 0.003 suits it.
+        out: folder of the run, for its settings, metrics, curves and checkpoint.
+        data: folder from tdf dataset; several folders give one network of several categories.
+        start_from: name of shipped weights or .safetensors file to start from. Their symmetry-breaking offset applies
+            unless --network.symmetry-breaking-offset is not 0. Use --learning-rate 0.003.
         minutes: choose --steps so that the run takes about so long on this machine.
         weights: .safetensors file to write at the end.
-        workers: processes that draw the samples of the steps to come.
+        workers: processes that draw the samples of the next steps.
         config: settings of the run.
     """
     from tdf_jax.viz.style import save_figure
     from tdf_jax.viz.training import training_figure
 
-    if minutes is not None and not 0 < minutes < float("inf"):
-        raise InputError(f"tdf train: --minutes is {minutes}; expected a positive number")
+    if minutes is not None:
+        checks.positive("tdf train", "--minutes", minutes)
     if workers < 0:
         raise InputError(
             f"tdf train: --workers is {workers}; expected 1 or more, or 0 for as many as suit this machine"
@@ -60,20 +61,23 @@ def train(
     target = _target(out, weights)
     model = None if start_from is None else load_model(start_from)
     if model is not None:
-        # Asymmetry is no size: a network may go on with another, and keeps its own where none is asked for.
-        network = dataclasses.replace(model.config, asymmetry=config.network.asymmetry)
+        # The symmetry-breaking offset is not a size: a network can be trained further with another one, and keeps its
+        # own by default.
+        offset = config.network.symmetry_breaking_offset
+        network = dataclasses.replace(model.config, symmetry_breaking_offset=offset)
         if network != config.network:
             raise InputError(
-                f"tdf train: --start-from {start_from} is a network of other sizes ({model.config}); expected {config.network}"
+                f"tdf train: --start-from {start_from} is a network of other sizes ({model.config}); "
+                f"expected {config.network}"
             )
-        config = dataclasses.replace(config, network=network if network.asymmetry else model.config)
+        config = dataclasses.replace(config, network=network if offset else model.config)
     if not data:
         data = (out / "data",)
         build(Recipe(seed=config.seed), data[0], os.cpu_count() or 1)
     objects, validation = (joined(sets) for sets in zip(*(load(folder) for folder in data)))
     before = settings_of(out)
     if minutes is not None:
-        # A run that stands keeps its steps: they are what its learning rate follows.
+        # A resumed run keeps its number of steps, on which its learning rate depends.
         steps = steps_within(minutes, config, objects, workers) if before is None else before["steps"]
         config = dataclasses.replace(config, steps=steps)
     params = run(config, objects, validation, out, initial=None if model is None else model.params, workers=workers)
@@ -86,7 +90,7 @@ def train(
 
 
 def _target(out: Path, weights: Path | None) -> Path:
-    """Where the weights go; what would fail after hours of training is refused before them."""
+    """Path of the weights; a path that cannot be written is refused before the training and not after hours."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -13,23 +13,26 @@ if TYPE_CHECKING:
 PART = 0.7  # of the points; of 0.35, 0.5, 0.7 and 0.9, tried on 30 mugs, this raised the IoU most
 
 
-def thin(points: Float[np.ndarray, "points 3"], count: int) -> Float[np.ndarray, "thinned 3"]:
-    """Evenly spread subset of a cloud by farthest-point thinning; arguments and errors as `thin_indices`."""
-    indices = thin_indices(points, count)
+def thin(points: Float[np.ndarray, "points 3"], count: int) -> Float[np.ndarray, "subset 3"]:
+    """Evenly spread subset of a cloud by farthest-point sampling; arguments and errors as `farthest_point_indices`."""
+    indices = farthest_point_indices(points, count)
     return points if len(indices) == len(points) else points[indices]
 
 
-def thinnings(points: Float[np.ndarray, "points 3"], count: int, times: int) -> Float[np.ndarray, "times count 3"]:
-    """Several farthest-point thinnings of one cloud: of all its points, then of random parts of it.
+def subsamples(points: Float[np.ndarray, "points 3"], count: int, times: int) -> Float[np.ndarray, "times count 3"]:
+    """Several farthest-point subsamples of one cloud: the first of all its points, the others of random parts of it.
 
-    The parts are a function of the number of points. A cloud of less than `2 * count / PART` points is thinned once: a
-    part that is hardly larger than the thinning is no longer spread evenly, and the average of such was worse than the
-    thinning of all.
+    The parts are a function of the number of points. A cloud of less than `2 * count / PART` points gives one
+    subsample: points of a part that is hardly larger than the subsample are not spread evenly any more, and the average
+    over such subsamples is worse than one of all points.
 
     Args:
-        points: Points, metres, more than count.
-        count: How many to keep, at least 1.
-        times: How many thinnings, at least 1.
+        points: point cloud, (points, 3), metres, more than `count`.
+        count: points of a subsample, at least 1.
+        times: number of subsamples, at least 1; fewer are returned of a sparse cloud, see above.
+
+    Returns:
+        The subsamples, (times, count, 3).
     """
     found = [thin(points, count)]
     rng = np.random.default_rng(len(points))
@@ -38,14 +41,14 @@ def thinnings(points: Float[np.ndarray, "points 3"], count: int, times: int) -> 
     return np.stack(found)
 
 
-def thin_indices(points: Float[np.ndarray, "points 3"], count: int) -> Int[np.ndarray, " thinned"]:
-    """Indices of a farthest-point thinning: deterministic, distinct, each the farthest from those before it.
+def farthest_point_indices(points: Float[np.ndarray, "points 3"], count: int) -> Int[np.ndarray, " subset"]:
+    """Indices of a farthest-point subsample: deterministic and distinct, each the farthest from those before it.
 
     The first is the point farthest from the mean; ties go to the lowest index.
 
     Args:
-        points: Points, metres.
-        count: How many to keep, at least 1.
+        points: point cloud, (points, 3), metres.
+        count: points to keep, at least 1.
 
     Returns:
         Indices in the order of choice; if there are no more points than count, all of them in their own order.

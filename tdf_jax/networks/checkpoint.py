@@ -1,7 +1,6 @@
-"""Weights on disk: one safetensors file with the network's sizes, its origin and a checksum of all of it."""
+"""Weights on disk: one safetensors file with parameters, sizes and origin of a network, and a checksum of them."""
 
 import dataclasses
-import hashlib
 import json
 import os
 from collections.abc import Mapping
@@ -16,29 +15,32 @@ import safetensors
 import safetensors.numpy
 from flax.traverse_util import flatten_dict, unflatten_dict
 
+from tdf_jax._internal.cache import digest
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
 from tdf_jax.networks.model import Model, ModelInfo, shape_problems, value_problems
-from tdf_jax.networks.occupancy import NetworkConfig, parameter_shapes
+from tdf_jax.networks.occupancy import FORMER_FIELDS, NetworkConfig, parameter_shapes
 
 SUFFIX = ".safetensors"
-SCHEMA = 1  # raised when a file written here could no longer be read by an older tdf_jax
-# All metadata under one key: safetensors writes several in random order, and equal models should be equal files.
+SCHEMA = 2  # rises if an older tdf_jax cannot read the files that are written here
+READABLE_SCHEMAS = (1, SCHEMA)  # files of schema 1 have the names in `FORMER_FIELDS`
+# All metadata are under one key because safetensors writes several keys in random order, and equal models should give
+# equal files.
 METADATA_KEY = "tdf_jax"
 HEADER_KEYS = {"schema", "config", "info", "sha256"}
 
 
 def available_models() -> tuple[str, ...]:
-    """Names of the weights that come with tdf_jax, for `load_model`."""
+    """Names of the weights that are shipped with tdf_jax, for `load_model`."""
     return tuple(_shipped())
 
 
 def save_model(model: Model, path: str | os.PathLike) -> None:
-    """Write a model to a file, replacing it only once the new one is complete. Equal models give equal files.
+    """Write a model to a file. The write is atomic, and equal models give equal files.
 
     Args:
-        model: what to write; its parameters are float32.
-        path: a `.safetensors` file in an existing directory.
+        model: network to write, with float32 parameters.
+        path: `.safetensors` file in an existing folder; an existing file is replaced.
 
     Raises:
         InputError: the path cannot be written, or the parameters do not fit the model's config or are not finite.
@@ -46,7 +48,7 @@ def save_model(model: Model, path: str | os.PathLike) -> None:
     target = Path(path)
     if target.suffix != SUFFIX:
         raise InputError(f"save_model(): got the path {target}; expected one that ends in {SUFFIX}")
-    # safetensors writes the memory as it lies, so a transposed view would be stored scrambled.
+    # safetensors writes memory in its own order, so it would scramble a transposed view.
     tensors = {name: np.ascontiguousarray(x) for name, x in flatten_dict(model.params, sep=".").items()}
     header = {
         "schema": SCHEMA,
@@ -66,22 +68,23 @@ def save_model(model: Model, path: str | os.PathLike) -> None:
 
 
 def load_model(name_or_path: str | os.PathLike) -> Model:
-    """Read a model by name or from a file, and check that it is whole.
+    """Read a model by name or from a file, and verify its checksum.
 
     Args:
-        name_or_path: a name from `available_models`, or the path of a `.safetensors` file that `save_model` wrote.
+        name_or_path: name from `available_models`, or path of a `.safetensors` file that `save_model` wrote.
 
     Returns:
         The model, with float32 parameters.
 
     Raises:
-        InputError: unknown name; missing, damaged or foreign file; weights of another architecture, or not finite.
+        InputError: the name is unknown; the file is missing, damaged or not from tdf_jax; or its weights are of another
+            architecture or not finite.
     """
     path = _locate(name_or_path)
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             header = _header(file.metadata())
-            config, info = _record(NetworkConfig, header["config"]), _record(ModelInfo, header["info"])
+            config, info = _record(NetworkConfig, _sizes(header)), _record(ModelInfo, header["info"])
             slices = {name: file.get_slice(name) for name in file.keys()}
             _check_shapes({name: tuple(part.get_shape()) for name, part in slices.items()}, config)
             _check_types({name: part.get_dtype() for name, part in slices.items()}, "F32")
@@ -89,13 +92,13 @@ def load_model(name_or_path: str | os.PathLike) -> Model:
             if _checksum(header, tensors) != header["sha256"]:
                 raise _Refusal("its checksum does not match its content: it was changed or damaged; copy it again")
             _check_values(tensors)
-            # jnp.array copies: the model must not depend on the mapped file.
+            # The model must not depend on the mapped file, and jnp.array copies.
             params = {name: jnp.array(tensor) for name, tensor in tensors.items()}
     except _Refusal as reason:
         raise InputError(f"load_model(): {path}: {reason}") from None
     except safetensors.SafetensorError as error:
         raise InputError(
-            f"load_model(): {path} is not a whole safetensors file ({error}): it is truncated, damaged or of another"
+            f"load_model(): {path} is not a valid safetensors file ({error}): it is truncated, damaged or of another"
             " kind; copy it again, or convert a PyTorch checkpoint with `tdf convert`"
         ) from None
     except OSError as error:
@@ -104,11 +107,14 @@ def load_model(name_or_path: str | os.PathLike) -> Model:
 
 
 class _Refusal(Exception):
-    """Why a model is not read or written; the public functions add who and what."""
+    """Reason why a model is not read or written; the public functions add their name and the file."""
 
 
 def _shipped() -> dict[str, Path]:
-    """Weights by name: package data of an installed wheel, or the folder `weights` of the checkout that an editable install points to."""
+    """Paths of the shipped weights by name.
+
+    They are package data of an installed wheel, or in the folder `weights` of the checkout of an editable install.
+    """
     folder = Path(str(resources.files("tdf_jax"))) / "weights"
     if not folder.is_dir() and (checkout := _editable_checkout()) is not None:
         folder = checkout / "weights"
@@ -116,7 +122,7 @@ def _shipped() -> dict[str, Path]:
 
 
 def _editable_checkout() -> Path | None:
-    """The checkout that this package is installed from in editable mode (PEP 610), or None."""
+    """Checkout that this package is installed from in editable mode (PEP 610), or None."""
     try:
         record = json.loads(metadata.distribution("tdf_jax").read_text("direct_url.json") or "{}")
     except metadata.PackageNotFoundError:
@@ -132,8 +138,7 @@ def _locate(name_or_path: str | os.PathLike) -> Path:
     is_name = not path.suffix and str(name_or_path) == path.name
     if is_name and path.name not in shipped:
         raise InputError(
-            f"load_model(): no weights are called {path.name!r}; expected a name that exists ({names})"
-            f" or the path of a {SUFFIX} file"
+            f"load_model(): there are no weights {path.name!r}; expected one of ({names}) or the path of a {SUFFIX} file"
         )
     path = shipped[path.name] if is_name else path
     if not path.is_file():
@@ -148,22 +153,31 @@ def _header(entries: Mapping[str, str] | None) -> dict:
         header = None
     if not isinstance(header, dict) or not HEADER_KEYS <= header.keys():
         raise _Refusal(
-            "it is not a file that tdf_jax wrote (its metadata are absent or damaged); expected one from save_model"
-            " or `tdf convert`"
+            "it has no metadata of tdf_jax, or damaged ones; expected a file from save_model or `tdf convert`"
         )
-    if header["schema"] != SCHEMA:
+    if header["schema"] not in READABLE_SCHEMAS:
         raise _Refusal(
-            f"its schema is {header['schema']}, this tdf_jax reads {SCHEMA}; use the tdf_jax that wrote it, or newer"
+            f"its schema is {header['schema']}; expected {' or '.join(map(str, READABLE_SCHEMAS))}. "
+            "Use the tdf_jax that wrote it, or a newer one"
         )
     return header
 
 
+def _sizes(header: Mapping) -> Mapping:
+    """The header's sizes of the network under today's names."""
+    if header["schema"] > 1 or not isinstance(header["config"], Mapping):
+        return header["config"]
+    return {FORMER_FIELDS.get(name, name): value for name, value in header["config"].items()}
+
+
 def _record(kind: type, values: Mapping):
-    """A dataclass from JSON values, each of the field's type; a float may be written as an integer."""
+    """A dataclass from JSON values, each of its field's type; an integer may stand for a float."""
     try:
         record = kind(**values)
     except TypeError as error:
         raise _Refusal(f"its {kind.__name__} does not have the expected fields ({error})") from None
+    except InputError as error:
+        raise _Refusal(f"its {error}") from None
     for field in dataclasses.fields(kind):
         value = getattr(record, field.name)
         if isinstance(value, bool) or not isinstance(value, int | float if field.type is float else field.type):
@@ -172,9 +186,8 @@ def _record(kind: type, values: Mapping):
 
 
 def _check_shapes(found: Mapping[str, tuple[int, ...]], config: NetworkConfig) -> None:
-    sizes = [getattr(config, field.name) for field in dataclasses.fields(config) if field.type is int]
-    # Every block has tensors of its own; without the bound a damaged count would keep the comparison busy for hours.
-    if min(sizes) < 1 or config.blocks > len(found):
+    # Every block has its own tensors. Without this bound, a damaged number of blocks would take hours to compare.
+    if config.blocks > len(found):
         raise _Refusal(f"its {len(found)} tensors cannot be those of {config}")
     problems = shape_problems(found, parameter_shapes(config))
     if problems:
@@ -194,10 +207,9 @@ def _check_values(tensors: Mapping[str, np.ndarray]) -> None:
 
 
 def _checksum(header: Mapping, tensors: Mapping[str, np.ndarray]) -> str:
-    """SHA-256 of the header (less the checksum) and of every tensor's name, shape and bytes."""
+    """SHA-256 of the header (without the checksum) and of every tensor's name, shape and bytes."""
     covered = {key: value for key, value in header.items() if key != "sha256"}
-    digest = hashlib.sha256(json.dumps(covered, sort_keys=True).encode())
+    parts = [json.dumps(covered, sort_keys=True).encode()]
     for name in sorted(tensors):
-        digest.update(f"\n{name} {tensors[name].shape}\n".encode())
-        digest.update(tensors[name].astype("<f4", copy=False).tobytes())
-    return digest.hexdigest()
+        parts += [f"\n{name} {tensors[name].shape}\n".encode(), tensors[name].astype("<f4", copy=False).tobytes()]
+    return digest(*parts)

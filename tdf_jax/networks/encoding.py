@@ -1,4 +1,4 @@
-"""From a point cloud to the field of one object."""
+"""Encoding: from the point cloud of an object to its descriptor field."""
 
 import functools
 
@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.deprecation import renamed_keywords
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.precision import full_precision
 from tdf_jax.geometry import sampling
@@ -15,108 +16,119 @@ from tdf_jax.networks.field import DescriptorField
 from tdf_jax.networks.model import Model
 from tdf_jax.networks.occupancy import condition, encode_latent
 
-CENTRED = 1e-7  # of a cloud's extent: a mean this near zero is float32's rounding
-ROOM = 250  # clouds that are not thinned are filled up to a multiple, which common sizes are already
-THINNINGS = 8  # 16 gain another 0.003 of IoU
-# radians; latents of one mug's thinnings are turned against each other by 1 to 2 degrees, those of symmetric objects by
-# 60 to 90 on average
+CENTRED = 1e-7  # of a cloud's extent: a mean below this is float32's rounding
+PADDING = 250  # sizes of clouds of unknown density are padded to a multiple of this; common sizes are multiples
+NUM_SUBSAMPLES = 8  # 16 gain another 0.003 of IoU
+# Radians. Latents of subsamples of one mug are rotated against each other by 1 to 2 degrees, those of symmetric objects
+# by 60 to 90 on average.
 SAME_SIDE = np.pi / 6
 
 
-def encode(model: Model, points: Float[Array, "points 3"], thinnings: int = THINNINGS) -> DescriptorField:
+@renamed_keywords(thinnings="num_subsamples")
+def encode(model: Model, points: Float[Array, "points 3"], num_subsamples: int = NUM_SUBSAMPLES) -> DescriptorField:
     """Encode an object's point cloud into its descriptor field.
 
-    A network knows clouds of one density (`model.info.cloud_points`): with twice as many points the shipped weights'
-    IoU falls from 0.85 to 0.24. A denser cloud is therefore thinned by farthest points, several times, and the latents
-    are averaged: each thinning is another sample of the surface, and eight of them raise the IoU by about 0.03 over
-    one. Where the density is not known, as of converted weights, and where the cloud is no denser, all points are used
-    as they are.
+    A network expects clouds of the density that it was trained on (`model.info.cloud_points`). `encode` therefore takes
+    several farthest-point subsamples of a denser cloud, which are different samples of the surface, and averages their
+    latents. It uses all points of a cloud that is no denser, and of every cloud if the density is unknown, as for
+    converted weights. docs/guide/training.md has the measurements.
 
     Args:
-        model: the network.
-        points: at least 21, metres, world frame.
-        thinnings: how many are averaged, see `sampling.thinnings`; 0 uses all points as they are.
+        model: network.
+        points: point cloud of the object, (points, 3), metres, world frame; at least 21 points.
+        num_subsamples: farthest-point subsamples to average, see `sampling.subsamples`; 0 uses all points.
 
     Returns:
-        The field, in the world frame. It moves and turns with the points but for ties that rounding decides: in
-        thinning, and, of a network with asymmetry, in which point is the farthest from the mean.
+        The field, in the world frame. It rotates and translates with the points, except for ties that rounding decides:
+        in farthest-point sampling, and, if the network has a symmetry-breaking offset, in which point is the farthest
+        from the centroid.
 
     Raises:
         InputError: the points are fewer than 21 or than the network's neighbours, not (points, 3), not finite or all
-            equal; thinnings is negative, or the points would be thinned under `jax.jit`.
+            equal; `num_subsamples` is negative; or the points are denser than the network's and traced by `jax.jit`.
     """
     points, count = checks.points("encode()", points), model.info.cloud_points
-    if not isinstance(thinnings, int | np.integer) or thinnings < 0:
-        raise InputError(f"encode(): thinnings is {thinnings}; expected a whole number of 0 or more")
+    num_subsamples = checks.count("encode()", "num_subsamples", num_subsamples, 0)
     if len(points) < model.config.neighbours:
         raise InputError(
-            f"encode(): there are {len(points)} points; expected at least the network's {model.config.neighbours} neighbours"
+            f"encode(): there are {len(points)} points; expected at least the network's "
+            f"{model.config.neighbours} neighbours"
         )
-    plain = not thinnings or count is None
-    dense = not plain and len(points) > count
-    traced = isinstance(points, jax.core.Tracer)
-    whole = points if traced else np.asarray(points)
-    # One for all thinnings, which then take the same side of a symmetric object for its front.
-    tip = whole[((whole - whole.mean(axis=0)) ** 2).sum(axis=1).argmax()]
+    traced = checks.traced(points)
+    dense = num_subsamples > 0 and count is not None and len(points) > count
     if traced and dense:
         raise InputError(
-            f"encode(): {len(points)} points cannot be thinned to {count} under jax.jit; expected that many. "
-            "Thin the cloud outside with tdf.thin, or pass thinnings=0"
+            f"encode(): {len(points)} points cannot be subsampled to {count} under jax.jit; expected that many. "
+            "Subsample the cloud outside with tdf.thin, or pass num_subsamples=0"
         )
-    clouds = sampling.thinnings(whole, count, thinnings) if dense else points[None]
-    if traced or any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(model.params)):
-        return _average(model.params, model.config, clouds, tip)
-    several, size = clouds.shape[:2]
-    # Filled up with clouds and points that do not count: clouds of many sizes run one program.
-    room = (1, -(-size // ROOM) * ROOM) if plain else (thinnings, count)
-    return _encode(model.params, model.config, np.resize(clouds, (*room, 3)), np.int32(several), np.int32(size), tip)
+    whole = points if traced else np.asarray(points)
+    # All subsamples share one anchor, so that they see the same side of a symmetric object as its front.
+    anchor = whole[((whole - whole.mean(axis=0)) ** 2).sum(axis=1).argmax()]
+    clouds = sampling.subsamples(whole, count, num_subsamples) if dense else points[None]
+    if traced or checks.traced(model.params):
+        return _average(model.params, model.config, clouds, anchor)
+    num_clouds, size = clouds.shape[:2]
+    # Padding with clouds and points that do not count lets clouds of many sizes run one program.
+    plain = num_subsamples == 0 or count is None
+    padded = (1, -(-size // PADDING) * PADDING) if plain else (num_subsamples, count)
+    clouds = np.resize(clouds, (*padded, 3))
+    return _encode(model.params, model.config, clouds, np.int32(num_clouds), np.int32(size), anchor)
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _encode(params, config, clouds, several, size, tip):
-    """The field of the first `several` clouds, averaged, of each of which the first `size` points count; the others are repetitions."""
+def _encode(params, config, clouds, num_clouds, size, anchor):
+    """The field averaged over the first `num_clouds` clouds, of their first `size` points; the rest is padding."""
     used = jnp.arange(clouds.shape[1]) < size
 
     def fill(index, state):
         return jax.tree.map(
-            lambda all, one: all.at[index].set(one), state, _latent(params, config, clouds[index], tip, used)
+            lambda all, one: all.at[index].set(one), state, _latent(params, config, clouds[index], anchor, used)
         )
 
     def add(index, sums):
-        return jax.tree.map(lambda sum, all: sum + jnp.where(agreed[index], all[index], 0), sums, (latents, origins))
+        return jax.tree.map(
+            lambda sum, all: sum + jnp.where(consistent[index], all[index], 0), sums, (latents, origins)
+        )
 
     dtype = jnp.result_type(clouds, *jax.tree.leaves(params))
     blank = jnp.zeros((len(clouds), config.latent, 3), dtype), jnp.zeros((len(clouds), 3), clouds.dtype)
-    latents, origins = jax.lax.fori_loop(0, several, fill, blank)
-    agreed = agreeing(latents, jnp.arange(len(clouds)) < several)
-    sums = jax.lax.fori_loop(0, several, add, jax.tree.map(lambda all: jnp.zeros_like(all[0]), blank))
-    latent, origin = (part / jnp.sum(agreed) for part in sums)
+    latents, origins = jax.lax.fori_loop(0, num_clouds, fill, blank)
+    consistent = consistent_latents(latents, jnp.arange(len(clouds)) < num_clouds)
+    sums = jax.lax.fori_loop(0, num_clouds, add, jax.tree.map(lambda all: jnp.zeros_like(all[0]), blank))
+    latent, origin = (part / jnp.sum(consistent) for part in sums)
     return DescriptorField(condition(params, config, latent), origin)
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _average(params, config, clouds, tip):
-    """The same of all points of all clouds, without a loop of unknown length, which has no reverse-mode derivative."""
-    latents, origins = jax.lax.map(lambda points: _latent(params, config, points, tip), clouds)
-    agreed = agreeing(jax.lax.stop_gradient(latents), jnp.ones(len(clouds), bool))
-    latent, origin = (jnp.mean(all, axis=0, where=agreed[:, *[None] * (all.ndim - 1)]) for all in (latents, origins))
+def _average(params, config, clouds, anchor):
+    """The same of all points of all clouds; its loops have known lengths, so it has a reverse-mode derivative."""
+    latents, origins = jax.lax.map(lambda points: _latent(params, config, points, anchor), clouds)
+    consistent = consistent_latents(jax.lax.stop_gradient(latents), jnp.ones(len(clouds), bool))
+    latent, origin = (
+        jnp.mean(all, axis=0, where=consistent[:, *[None] * (all.ndim - 1)]) for all in (latents, origins)
+    )
     return DescriptorField(condition(params, config, latent), origin)
 
 
 @full_precision
-def agreeing(latents: Float[Array, "thinnings latent 3"], used: Bool[Array, " thinnings"]) -> Bool[Array, " thinnings"]:
-    """Which latents of one object show it in the same of several poses that it cannot be told apart in.
+def consistent_latents(
+    latents: Float[Array, "subsamples latent 3"], used: Bool[Array, " subsamples"]
+) -> Bool[Array, " subsamples"]:
+    """Which latents of one symmetric object show it in the same of its equivalent poses.
 
-    Thinned this way or that, a symmetric object looks a little more like one of the poses its symmetry makes equal or
-    like another, and the network decides for one of them: a flat bottle's two sides change places, a round one is
-    turned about its axis. The mean of such latents is the latent of none of them: of round bottles it had an IoU of
-    0.87, each alone 0.93. Two latents agree if a rotation would bring them no nearer than to half of their squared
-    distance, or turns by less than `SAME_SIDE`; those that agree with the one that most others agree with are kept, of
-    an object without symmetry all.
+    A symmetric object looks the same in several poses. Each subsample of it looks slightly more like one of these poses
+    than like the others, and the network decides for that one: the two sides of a flat bottle change places, a round
+    bottle is rotated about its axis. The mean of such latents represents none of the poses. Two latents are consistent
+    if no rotation brings them nearer than half of their squared distance, or if the best rotation is smaller than
+    `SAME_SIDE`. The function keeps the latents that are consistent with the one that has most others consistent with
+    it; those are all latents of an object without symmetry.
 
     Args:
-        latents: of thinnings of one cloud.
-        used: those that count.
+        latents: latents of subsamples of one cloud, (subsamples, latent, 3).
+        used: mask of those that count, (subsamples,).
+
+    Returns:
+        Mask of the latents to average, (subsamples,).
 
     Source:
         The best rotation is Kabsch's, Acta Crystallographica A, 1976.
@@ -134,11 +146,11 @@ def agreeing(latents: Float[Array, "thinnings latent 3"], used: Bool[Array, " th
     return agree[jnp.argmax(jnp.sum(agree, axis=1))]
 
 
-def _latent(params, config, points, tip, used=None):
-    """Latent and origin of a cloud with a farthest point `tip`, or of the part of it that is used."""
+def _latent(params, config, points, anchor, used=None):
+    """Latent and origin of a cloud, or of its used points, displaced away from `anchor` (world frame)."""
     origin = jnp.mean(points, axis=0, where=None if used is None else used[:, None])
-    # A cloud that was centred in float32 has a mean of about 1e-9 m left. Centring it again in float64 moves the latent
-    # by 1e-6 of its length, so it counts as centred: parity with the original, which leaves centring to the caller, is
-    # then exact.
+    # A cloud that was centred in float32 keeps a mean of about 1e-9 m, and centring it again in float64 moves the
+    # latent by 1e-6 of its length. Such a cloud counts as centred, so that parity with the original network, which
+    # leaves centring to the caller, is exact.
     origin = jnp.where(jnp.max(jnp.abs(origin)) <= CENTRED * jnp.max(jnp.ptp(points, axis=0)), 0.0, origin)
-    return encode_latent(params, config, points - origin, used, tip - origin), origin
+    return encode_latent(params, config, points - origin, used, anchor - origin), origin

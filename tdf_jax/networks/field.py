@@ -1,4 +1,4 @@
-"""The descriptor field of one object: every point of space has an occupancy and a descriptor."""
+"""The descriptor field of one object: an occupancy and a descriptor at every point of space."""
 
 import dataclasses
 import functools
@@ -14,12 +14,12 @@ from tdf_jax.networks.occupancy import NORM_FLOOR, Conditioned, decode
 @functools.partial(jax.tree_util.register_dataclass, data_fields=["conditioned", "origin"], meta_fields=[])
 @dataclasses.dataclass(frozen=True)
 class DescriptorField:
-    """f(x | P) of Neural Descriptor Fields: a conditioned decoder, and where its object is.
+    """f(x | P) of Neural Descriptor Fields: a conditioned decoder and the position of its object.
 
     Attributes:
-        conditioned: the decoder folded onto the object's latent.
-        origin: mean of the points it was encoded from, (3,), metres, world frame; the object frame has the world's
-            axes.
+        conditioned: decoder folded onto the object's latent.
+        origin: centroid of the encoded points, (3,), metres, world frame. The object frame has its origin there and the
+            axes of the world.
     """
 
     conditioned: Conditioned
@@ -27,26 +27,25 @@ class DescriptorField:
 
     @property
     def latent(self) -> Float[Array, "latent 3"]:
-        """The latent z; its vectors turn with the cloud."""
+        """The latent z; its vectors rotate with the cloud."""
         return self.conditioned.latent
 
     def descriptors(self, x: Float[Array, "*batch 3"]) -> Float[Array, "*batch channels"]:
         """Point descriptors, of unit length.
 
         Args:
-            x: points, metres, world frame.
+            x: points, (..., 3), metres, world frame.
         """
         activations, _ = self._decode("descriptors", x)
         descriptor = jnp.concatenate(activations, axis=-1)
-        # |p|^2 and fc_in are never all zero together in a trained network, so the square root is differentiable where
-        # it matters.
+        # In a trained network |p|^2 and fc_in are never zero at the same point, so the square root is differentiable.
         return descriptor / jnp.maximum(jnp.sqrt(jnp.sum(descriptor**2, axis=-1, keepdims=True)), NORM_FLOOR)
 
     def occupancy(self, x: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
         """Probability that points lie inside the object, in [0, 1].
 
         Args:
-            x: points, metres, world frame.
+            x: points, (..., 3), metres, world frame.
         """
         return jax.nn.sigmoid(self._decode("occupancy", x)[1])
 

@@ -1,26 +1,26 @@
-"""A trained network: its parameters, its sizes and where it came from."""
+"""A trained network: its parameters, its sizes and its origin."""
 
 import dataclasses
 import functools
-import hashlib
 import json
 from collections.abc import Mapping
 
 import jax
 import numpy as np
 
-from tdf_jax.networks.occupancy import NetworkConfig
+from tdf_jax._internal.cache import digest
+from tdf_jax.networks.occupancy import FORMER_FIELDS, NetworkConfig
 
 
 @dataclasses.dataclass(frozen=True)
 class ModelInfo:
-    """Where a network came from.
+    """Origin of a network.
 
     Attributes:
         name: short name, such as "mug".
-        source: what made it: a training run, or the file it was converted from.
-        cloud_points: farthest points of the clouds it was trained on; None if unknown.
-        description: anything else worth knowing.
+        source: training run that made it, or file that it was converted from.
+        cloud_points: points of the farthest-point subsamples that it was trained on; None if unknown.
+        description: further remarks.
     """
 
     name: str
@@ -35,9 +35,9 @@ class Model:
     """An occupancy network; a pytree whose leaves are its parameters.
 
     Attributes:
-        params: nested dictionaries of arrays, under the names of `network.parameter_shapes`.
-        config: the network's sizes.
-        info: where it came from.
+        params: parameters, nested dictionaries of arrays under the names of `occupancy.parameter_shapes`.
+        config: sizes of the network.
+        info: origin of the network.
     """
 
     params: dict
@@ -46,7 +46,7 @@ class Model:
 
 
 def shape_problems(found: Mapping[str, tuple[int, ...]], expected: Mapping[str, tuple[int, ...]]) -> str:
-    """Every tensor that is missing, not expected or of another shape, by name; empty if there is none."""
+    """Names of the tensors that are missing, unexpected or of another shape; empty if there are none."""
     missing = [f"{name} {shape}" for name, shape in expected.items() if name not in found]
     extra = [f"{name} {shape}" for name, shape in found.items() if name not in expected]
     misshapen = [
@@ -59,12 +59,13 @@ def shape_problems(found: Mapping[str, tuple[int, ...]], expected: Mapping[str, 
 
 
 def value_problems(tensors: Mapping[str, np.ndarray]) -> str:
-    """Every tensor that holds NaN or infinity, by name; empty if there is none."""
+    """Names of the tensors that contain NaN or infinity; empty if there are none."""
     return ", ".join(name for name, tensor in tensors.items() if not np.isfinite(tensor).all())
 
 
 def fingerprint(model: Model) -> str:
-    """A digest of all that a model's results depend on: weights, sizes, and the clouds it was trained on."""
-    digest = hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(model.params)))
-    digest.update(json.dumps([dataclasses.asdict(model.config), model.info.cloud_points]).encode())
-    return digest.hexdigest()
+    """Digest of all that a model's results depend on: its weights, its sizes and the density of its training clouds."""
+    # Digests name results on disk, so they keep the field names of the release before.
+    former = {new: old for old, new in FORMER_FIELDS.items()}
+    sizes = {former.get(name, name): value for name, value in dataclasses.asdict(model.config).items()}
+    return digest(*jax.tree.leaves(model.params), json.dumps([sizes, model.info.cloud_points]).encode())

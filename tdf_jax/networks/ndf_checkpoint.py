@@ -1,7 +1,7 @@
-"""Published Neural Descriptor Fields checkpoints (PyTorch `.pth`) -> `Model`, without torch.
+"""Conversion of published Neural Descriptor Fields checkpoints (PyTorch `.pth`) to a `Model`, without torch.
 
-Nothing in the file is executed: `torch_pickle` says what its tensors are, this module checks them against the network,
-reads their bytes and renames them.
+Nothing in the file is executed. `torch_pickle` interprets the descriptions of its tensors; this module compares them
+with the network, reads their bytes and renames them.
 """
 
 import contextlib
@@ -22,8 +22,8 @@ from tdf_jax.networks.model import Model, ModelInfo, shape_problems, value_probl
 from tdf_jax.networks.occupancy import NetworkConfig, parameter_shapes
 from tdf_jax.networks.torch_pickle import STORAGE_LIMIT, Refusal, Tensor, interpret
 
-PICKLE_LIMIT = 2**20  # bytes; the published network's is 10 kB
-WRAPPERS = ("state_dict", "model_state_dict", "model")  # where training scripts put the network inside a dictionary
+PICKLE_LIMIT = 2**20  # bytes; that of the published network has 10 kB
+WRAPPERS = ("state_dict", "model_state_dict", "model")  # keys under which training scripts save the network
 RESAVE = 'if you trust it, re-save it with PyTorch: torch.save(torch.load(p, map_location="cpu"), new)'
 
 
@@ -31,16 +31,17 @@ def convert_checkpoint(path: str | os.PathLike, name: str | None = None) -> Mode
     """Convert a PyTorch checkpoint of the published layout (`ndf_robot`'s `VNNOccNet`); the latent size is inferred.
 
     Args:
-        path: a `.pth` file that `torch.save` wrote (a zip, as since PyTorch 1.6): a state_dict, bare or under one of
-            the keys state_dict, model_state_dict or model, with or without a `module.` prefix on every name. Half
-            and double precision are cast to float32.
-        name: the model's name; the file's by default.
+        path: `.pth` file that `torch.save` wrote (a zip, as since PyTorch 1.6). It holds a state_dict, bare or under
+            one of the keys state_dict, model_state_dict or model, with or without a `module.` prefix on every name.
+            Half and double precision are cast to float32.
+        name: name of the model; by default that of the file.
 
     Returns:
-        The model. Kernels are (in, out), transposed from PyTorch's (out, in).
+        The model. Its kernels are (in, out), transposed from PyTorch's (out, in).
 
     Raises:
-        InputError: not such a file, damaged, asking for anything but tensors, or of another architecture.
+        InputError: the file is of another kind or damaged, its pickle names anything but tensors, or it is of another
+            architecture.
     """
     path = Path(path)
     try:
@@ -92,7 +93,7 @@ def _state_dict(tree: object) -> dict[str, Tensor]:
 
 
 def _infer_config(shapes: Mapping[str, tuple[int, ...]]) -> NetworkConfig:
-    """Latent size and decoder width by majority: one wrong tensor is then reported as that one, not as all others."""
+    """Latent size and decoder width by majority, so that a single wrong tensor is reported and not all others."""
     default = NetworkConfig()
     latents = [
         shapes[name][0]
@@ -128,7 +129,8 @@ def _open(path: Path) -> zipfile.ZipFile:
             start = file.read(512)
         if start.startswith(b"PK\x03\x04"):
             return zipfile.ZipFile(path)
-    # Before PyTorch 1.6: pickles one after another, which begin with the protocol's byte; earlier still: a tar.
+    # Files from before PyTorch 1.6 are consecutive pickles, which begin with the byte of their protocol; older ones are
+    # tar archives.
     if start.startswith(b"\x80") or start[257:262] == b"ustar":
         raise Refusal(f"it is a pickle or PyTorch's old format, not a zip archive; {RESAVE}")
     raise Refusal("it is not a PyTorch checkpoint: it does not begin as a zip archive; expected a file from torch.save")
@@ -140,7 +142,7 @@ def _member(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
             info = archive.getinfo(name)
         except KeyError:
             raise Refusal(f"{name} is missing from its zip archive; copy or download it again") from None
-        # torch.save never compresses. Stored members cannot be larger than the file: no zip bombs.
+        # torch.save never compresses. A stored member cannot be larger than the file, which excludes zip bombs.
         if info.compress_type != zipfile.ZIP_STORED or info.compress_size != info.file_size:
             raise Refusal(f"{name} is compressed, which torch.save never does; {RESAVE}")
         if info.file_size > limit:
@@ -149,7 +151,7 @@ def _member(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
 
 
 def _byte_order(archive: zipfile.ZipFile, root: str) -> str:
-    """Numpy's sign of the storages' byte order; older files do not say, and are little-endian."""
+    """Numpy's sign for the byte order of the storages; older files do not state it and are little-endian."""
     if root + "byteorder" not in archive.namelist():
         return "<"
     order = _member(archive, root + "byteorder", limit=16)
@@ -159,7 +161,7 @@ def _byte_order(archive: zipfile.ZipFile, root: str) -> str:
 
 
 def _read(archive: zipfile.ZipFile, root: str, name: str, tensor: Tensor, order: str) -> np.ndarray:
-    """A tensor's numbers in float32."""
+    """Values of a tensor in float32."""
     storage = tensor.storage
     dtype = jnp.dtype(storage.dtype)
     if not jnp.issubdtype(dtype, jnp.floating):
@@ -167,10 +169,10 @@ def _read(archive: zipfile.ZipFile, root: str, name: str, tensor: Tensor, order:
     raw = _member(archive, f"{root}data/{storage.key}", STORAGE_LIMIT)
     if len(raw) != storage.count * dtype.itemsize:
         raise Refusal(f"{name} has {len(raw)} bytes; expected {storage.count} {dtype} numbers; copy the file again")
-    # Unsigned integers first: numpy cannot swap the bytes of bfloat16.
+    # The bytes are read as unsigned integers because numpy cannot swap those of bfloat16.
     words = np.frombuffer(raw, f"{order}u{dtype.itemsize}")
     numbers = words.astype(f"=u{dtype.itemsize}").view(dtype)[tensor.offset :]
     strides = [stride * dtype.itemsize for stride in tensor.strides]
     view = np.lib.stride_tricks.as_strided(numbers, tensor.shape, strides)
-    with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite, which the caller reports by name
+    with np.errstate(over="ignore"):  # the caller reports float64 values that become infinite
         return view.astype(np.float32)

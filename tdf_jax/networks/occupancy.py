@@ -1,11 +1,11 @@
 """The Neural Descriptor Fields occupancy network (`VNNOccNet`, model type "pointnet") in Flax Linen.
 
-A cloud of points becomes a latent of 3-vectors that turns with the cloud (`encode_latent`); the latent, folded into
-the decoder's first layer (`condition`), answers points of space with an occupancy and a descriptor (`decode`).
+The encoder turns a point cloud into a latent of 3-vectors that rotates with the cloud (`encode_latent`). `condition`
+folds the latent into the decoder's first layer, and `decode` evaluates occupancy and descriptor activations at points.
 
 Parameter names are those of the published PyTorch checkpoints, except that a `weight` (out, in) is a `kernel` (in, out)
 here. A vector feature is a tuple of its three planes, x, y and z, each (points, channels): on a CPU the scalar products
-of the vector ReLU then fuse with their neighbours, 10 times faster than a sum over an axis of one array.
+of the vector ReLU then fuse with their neighbours, which a sum over an axis of one array does not do.
 
 References:
     Simeonov et al., Neural Descriptor Fields, 2021; Deng et al., Vector Neurons, 2021.
@@ -23,23 +23,28 @@ import jax.numpy as jnp
 from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Bool, Float
 
+from tdf_jax._internal import checks
+from tdf_jax._internal.deprecation import renamed_fields
+from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.precision import full_precision
 from tdf_jax.networks.vector_neurons import (
     EdgeConvolution,
     VectorLeakyReLU,
     VectorLinear,
     VectorResidualBlock,
-    farthest,
     map_planes,
     vector_dot,
 )
 
 NORM_FLOOR = 1e-12  # least norm a descriptor is divided by, as in the original
+# Fields of `NetworkConfig` by their names in the release before, in which files and run folders may have them.
+FORMER_FIELDS = {"asymmetry": "symmetry_breaking_offset"}
 
 
+@renamed_fields(**FORMER_FIELDS)
 @dataclasses.dataclass(frozen=True)
 class NetworkConfig:
-    """Sizes of the occupancy network; the defaults are the published mug network's (1,757,185 parameters).
+    """Sizes of the occupancy network; the defaults are those of the published mug network.
 
     Attributes:
         latent: number of 3-vectors in the latent.
@@ -50,9 +55,10 @@ class NetworkConfig:
         neighbours: nearest neighbours of an edge feature, the point itself included.
         slope: negative slope of the encoder's vector leaky ReLUs and of the decoder's last activation.
         scaling: factor on all coordinates before the network; the network's unit is 0.1 m.
-        asymmetry: the encoder sees a cloud displaced by this share of the vector from its mean to its farthest point,
-            away from that point; 0 as published. What a rotation leaves as it is, an equivariant network shows as a
-            figure of revolution; displaced, a square bowl has a side to begin at.
+        symmetry_breaking_offset: displacement of the cloud before the encoder, a share of the vector from the centroid
+            to the farthest point, away from that point; 0 as published. An equivariant network cannot tell apart
+            directions that a rotation of the object exchanges, and shows such an object as a figure of revolution.
+            Displaced, a square bowl has one side that differs from the others.
     """
 
     latent: int = 256
@@ -63,12 +69,63 @@ class NetworkConfig:
     neighbours: int = 20
     slope: float = 0.2
     scaling: float = 10.0
-    asymmetry: float = 0.0
+    symmetry_breaking_offset: float = 0.0
+
+    def __post_init__(self):
+        for field in dataclasses.fields(self):
+            if field.type is int:
+                checks.count("NetworkConfig()", field.name, getattr(self, field.name))
+        checks.number("NetworkConfig()", "slope", self.slope)
+        checks.positive("NetworkConfig()", "scaling", self.scaling)
+        offset = self.symmetry_breaking_offset
+        checks.number("NetworkConfig()", "symmetry_breaking_offset", offset, 0)
+        if offset >= 1:
+            raise InputError(f"NetworkConfig(): symmetry_breaking_offset is {offset}; expected 0 to less than 1")
 
     @property
     def channels(self) -> int:
-        """Numbers in one point descriptor: 2049 at the default sizes."""
+        """Channels of a point descriptor."""
         return 2 * self.latent + 1 + (self.blocks + 1) * self.decoder_width
+
+
+class Encoder(nn.Module):
+    """The vector-neuron PointNet: it maps a centred cloud to a latent that rotates with the cloud, exactly."""
+
+    config: NetworkConfig
+
+    def setup(self):
+        """Make the layers, under the published names."""
+        config = self.config
+        hidden, width = config.vector_hidden, config.vector_width
+        self.conv_pos = EdgeConvolution(hidden, config.neighbours, config.slope)
+        self.fc_pos = VectorLinear(hidden, width)
+        for index in range(config.blocks):
+            setattr(self, f"block_{index}", VectorResidualBlock(width, hidden, config.slope))
+        self.actvn_c = VectorLeakyReLU(hidden, config.slope)
+        self.fc_c = VectorLinear(hidden, config.latent)
+
+    def __call__(
+        self,
+        points: Float[Array, "points 3"],
+        used: Bool[Array, " points"] | None = None,
+        anchor: Float[Array, "3"] | None = None,
+    ) -> Float[Array, "latent 3"]:
+        """The latent of a cloud; arguments as those of `encode_latent`."""
+        if self.config.symmetry_breaking_offset:
+            anchor = farthest_point(points, used) if anchor is None else anchor
+            points = points - self.config.symmetry_breaking_offset * anchor
+        where = None if used is None else used[:, None]
+        x, pooled = self.fc_pos(self.conv_pos(points * self.config.scaling, used)), None
+        for index in range(self.config.blocks):
+            x = getattr(self, f"block_{index}")(x, pooled)
+            pooled = map_planes(lambda plane: jnp.mean(plane, axis=0, keepdims=True, where=where), x)
+        return jnp.concatenate(self.fc_c(self.actvn_c(pooled))).T
+
+
+def farthest_point(points: Float[Array, "points 3"], used: Bool[Array, " points"] | None = None) -> Float[Array, "3"]:
+    """The point of a centred cloud, or of its used points, that is farthest from the centroid."""
+    squared = jnp.sum(points**2, axis=1)
+    return points[jnp.argmax(squared if used is None else jnp.where(used, squared, -1))]
 
 
 class Affine(nn.Module):
@@ -79,19 +136,21 @@ class Affine(nn.Module):
     gain: float = 1.0
 
     def setup(self):
+        """Make the parameters."""
         initial = nn.initializers.variance_scaling(self.gain, "fan_in", "normal")
         self.kernel = self.param("kernel", initial, (self.inputs, self.outputs))
         self.bias = self.param("bias", nn.initializers.zeros, (self.outputs,))
 
 
 class ResidualBlock(nn.Module):
-    """Weights of `x + fc_1(relu(fc_0(relu(x))))`; `decode` computes it."""
+    """Weights of `x + fc_1(relu(fc_0(relu(x))))`, which `decode` evaluates."""
 
     width: int
 
     def setup(self):
+        """Make the layers, under the published names."""
         self.fc_0 = Affine(self.width, self.width, gain=2.0)
-        # A small second layer starts every block near the identity: five of them then keep the variance of fc_in's
+        # A small second layer starts every block near the identity, so that five of them keep the variance of fc_in's
         # output.
         self.fc_1 = Affine(self.width, self.width, gain=0.1)
 
@@ -106,12 +165,12 @@ class Conditioned:
     """The decoder folded onto one latent: everything that does not depend on the query point is a constant.
 
     Attributes:
-        latent: z, (latent, 3), per 0.1 m.
+        latent: latent z, (latent, 3), in the network's unit (0.1 m).
         invariants: sum over xyz of z * z_in(z), (latent,).
-        into: the folded `fc_in`: (square (width,), linear (3, width), bias (width,)) of the scaled query point.
-        blocks: per residual block (kernel, bias, kernel, bias).
+        into: folded `fc_in` of the scaled query point: (square (width,), linear (3, width), bias (width,)).
+        blocks: one (kernel, bias, kernel, bias) for every residual block.
         out: `fc_out`, (kernel (width,), bias ()).
-        config: the network's sizes.
+        config: sizes of the network.
     """
 
     latent: Float[Array, "latent 3"]
@@ -123,11 +182,12 @@ class Conditioned:
 
 
 class Decoder(nn.Module):
-    """The decoder's weights; `condition` folds them onto a latent and `decode` evaluates the result."""
+    """Weights of the decoder. `condition` folds them onto a latent, and `decode` evaluates the result."""
 
     config: NetworkConfig
 
     def setup(self):
+        """Make the layers, under the published names."""
         latent, width = self.config.latent, self.config.decoder_width
         self.z_in = VectorLinear(latent, latent)
         self.fc_in = Affine(2 * latent + 1, width)
@@ -136,6 +196,7 @@ class Decoder(nn.Module):
         self.fc_out = Affine(width, 1)
 
     def __call__(self, latent: Float[Array, "latent 3"]) -> Conditioned:
+        """The decoder folded onto a latent."""
         size = self.config.latent
         planes = tuple(latent.T)
         invariants = vector_dot(planes, self.z_in(planes))
@@ -157,22 +218,25 @@ class OccupancyNetwork(nn.Module):
     config: NetworkConfig = NetworkConfig()
 
     def setup(self):
+        """Make both parts."""
         self.encoder = Encoder(self.config)
         self.decoder = Decoder(self.config)
 
     def __call__(self, points: Float[Array, "points 3"]) -> Conditioned:
-        """Args: points, centred, in metres."""
+        """The decoder folded onto the latent of a cloud that is centred on its mean, metres."""
         return self.decoder(self.encoder(points))
 
     def encode_latent(
         self,
         points: Float[Array, "points 3"],
         used: Bool[Array, " points"] | None = None,
-        tip: Float[Array, "3"] | None = None,
+        anchor: Float[Array, "3"] | None = None,
     ) -> Float[Array, "latent 3"]:
-        return self.encoder(points, used, tip)
+        """The latent of a cloud; arguments as those of the function `encode_latent`."""
+        return self.encoder(points, used, anchor)
 
     def condition(self, latent: Float[Array, "latent 3"]) -> Conditioned:
+        """The decoder folded onto a latent."""
         return self.decoder(latent)
 
 
@@ -182,24 +246,27 @@ def encode_latent(
     config: NetworkConfig,
     points: Float[Array, "points 3"],
     used: Bool[Array, " points"] | None = None,
-    tip: Float[Array, "3"] | None = None,
+    anchor: Float[Array, "3"] | None = None,
 ) -> Float[Array, "latent 3"]:
     """The latent z of a cloud.
 
     Args:
-        params: of the network.
-        config: its sizes.
-        points: centred on their mean, metres.
-        used: which of them count; all by default.
-        tip: where `config.asymmetry` takes the farthest point to be, relative to the mean; by default the farthest of
-            those that count.
+        params: parameters of the network.
+        config: sizes of the network.
+        points: point cloud, (points, 3), metres, relative to its mean.
+        used: mask of the points that count, (points,); all of them by default.
+        anchor: point that `config.symmetry_breaking_offset` displaces the cloud away from, (3,), metres, relative to
+            the mean; by default the farthest of the points that count.
+
+    Returns:
+        The latent, (latent, 3), in the network's unit; its vectors rotate with the cloud.
     """
-    return OccupancyNetwork(config).apply({"params": params}, points, used, tip, method="encode_latent")
+    return OccupancyNetwork(config).apply({"params": params}, points, used, anchor, method="encode_latent")
 
 
 @full_precision
 def condition(params, config: NetworkConfig, latent: Float[Array, "latent 3"]) -> Conditioned:
-    """The decoder folded onto a latent."""
+    """The decoder of a network folded onto a latent, (latent, 3), from `encode_latent`."""
     return OccupancyNetwork(config).apply({"params": params}, latent, method="condition")
 
 
@@ -208,12 +275,12 @@ def decode(conditioned: Conditioned, x: Float[Array, "*batch 3"]) -> tuple[list,
     """Evaluate a conditioned decoder.
 
     Args:
-        conditioned: from `condition`.
-        x: query points relative to the cloud's mean, metres.
+        conditioned: decoder from `condition`.
+        x: query points, (..., 3), metres, relative to the cloud's mean.
 
     Returns:
-        The activations a descriptor is made of, in its order (|p|^2, z p, invariants, fc_in, blocks), each (*batch,
-        width), and the occupancy logits (*batch,).
+        The activations that form a descriptor, in its order (|p|^2, z p, invariants, fc_in, blocks), each (..., width),
+        and the occupancy logits, (...).
     """
     p = x * conditioned.config.scaling
     square = jnp.sum(p * p, axis=-1, keepdims=True)
@@ -233,7 +300,7 @@ def initialise(key, config: NetworkConfig = NetworkConfig()) -> dict:
     return OccupancyNetwork(config).init(key, jnp.zeros((config.neighbours + 1, 3)))["params"]
 
 
-@functools.cache  # a tenth of a second, and every load asks for it
+@functools.cache  # it takes a tenth of a second, and every load calls it
 def parameter_shapes(config: NetworkConfig) -> Mapping[str, tuple[int, ...]]:
     """Shape of every parameter, by dotted name."""
     shapes = jax.eval_shape(lambda: initialise(jax.random.key(0), config))
@@ -241,35 +308,5 @@ def parameter_shapes(config: NetworkConfig) -> Mapping[str, tuple[int, ...]]:
 
 
 def parameter_count(config: NetworkConfig) -> int:
+    """Number of parameters of a network."""
     return sum(math.prod(shape) for shape in parameter_shapes(config).values())
-
-
-class Encoder(nn.Module):
-    """The vector-neuron PointNet: a centred cloud -> a latent that turns with it, exactly."""
-
-    config: NetworkConfig
-
-    def setup(self):
-        config = self.config
-        hidden, width = config.vector_hidden, config.vector_width
-        self.conv_pos = EdgeConvolution(hidden, config.neighbours, config.slope)
-        self.fc_pos = VectorLinear(hidden, width)
-        for index in range(config.blocks):
-            setattr(self, f"block_{index}", VectorResidualBlock(width, hidden, config.slope))
-        self.actvn_c = VectorLeakyReLU(hidden, config.slope)
-        self.fc_c = VectorLinear(hidden, config.latent)
-
-    def __call__(
-        self,
-        points: Float[Array, "points 3"],
-        used: Bool[Array, " points"] | None = None,
-        tip: Float[Array, "3"] | None = None,
-    ) -> Float[Array, "latent 3"]:
-        if self.config.asymmetry:
-            points = points - self.config.asymmetry * (farthest(points, used) if tip is None else tip)
-        where = None if used is None else used[:, None]
-        x, pooled = self.fc_pos(self.conv_pos(points * self.config.scaling, used)), None
-        for index in range(self.config.blocks):
-            x = getattr(self, f"block_{index}")(x, pooled)
-            pooled = map_planes(lambda plane: jnp.mean(plane, axis=0, keepdims=True, where=where), x)
-        return jnp.concatenate(self.fc_c(self.actvn_c(pooled))).T

@@ -1,8 +1,8 @@
 """The pickle inside a PyTorch checkpoint, interpreted without being executed.
 
-`torch.save` writes a zip of raw storages and a pickle that says how they form tensors. Python's unpickler would
-import and call whatever a pickle names. This interpreter knows only the instructions a state_dict needs; the few things
-such a pickle may name are strings to it, never imported, and anything else is refused by its name.
+`torch.save` writes a zip of raw storages and a pickle that describes how they form tensors. Python's unpickler would
+import and call whatever the pickle names. This interpreter knows only the instructions that a state_dict needs. It
+treats the few names that such a pickle may contain as strings, never imports them, and refuses all other names.
 """
 
 import dataclasses
@@ -24,23 +24,25 @@ STORAGES = {
     "torch.BoolStorage": "bool",
 }
 CONSTRUCTORS = {"collections.OrderedDict", "torch._utils._rebuild_tensor_v2", "torch._utils._rebuild_parameter"}
-STORAGE_LIMIT = 2**30  # bytes; the published network's largest is 0.5 MB
-DIMENSION_LIMIT = 8  # bounds the product of a shape that a hostile file gives; the network's tensors have two
+STORAGE_LIMIT = 2**30  # bytes; the largest of the published network has 0.5 MB
+DIMENSION_LIMIT = 8  # bounds the product of a hostile file's shape; tensors of the network have two dimensions
 
 
 class Refusal(Exception):
-    """Why a file is not converted; `convert_checkpoint` adds which."""
+    """Reason why a file is not converted; `convert_checkpoint` adds the file."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Global:
-    """Something the pickle names; a string, never looked up."""
+    """A name in the pickle: a string that is never looked up."""
 
     name: str
 
 
 @dataclasses.dataclass(frozen=True)
 class Storage:
+    """A block of numbers: key of its zip member, type and number of elements."""
+
     key: str
     dtype: str
     count: int
@@ -57,7 +59,7 @@ class Tensor:
 
 
 def interpret(pickled: bytes) -> object:
-    """What a state_dict's pickle describes: dictionaries, lists, tuples, numbers, strings and `Tensor`s."""
+    """Content of a state_dict's pickle: dictionaries, lists, tuples, numbers, strings and `Tensor`s."""
     try:
         return _run(pickled)
     except (ValueError, IndexError, KeyError) as error:  # a malformed instruction, an empty stack, an unknown memo
@@ -125,7 +127,7 @@ def _run(pickled: bytes) -> object:
                 arguments, function = _expect(stack.pop(), tuple), _expect(stack.pop(), _Global)
                 stack.append(_construct(function.name, arguments))
             case "BUILD":
-                # Attributes of the dictionary below, dropped: PyTorch gives `_metadata`, layer versions of no use here.
+                # Attributes of a dictionary are dropped: PyTorch's `_metadata` are versions of layers, of no use here.
                 _expect(stack.pop(), dict)
                 _expect(stack[-1], dict)
             case _:
@@ -150,10 +152,10 @@ def _expect(value: object, kind: type):
 
 
 def _set_items(target: object, items: list) -> None:
-    """Args: items, key and value in turn."""
+    """Put items, which are keys and values in turn, into a dictionary."""
     _expect(target, dict)
     for key, value in zip(items[::2], items[1::2], strict=True):
-        # Only flat keys: hashing a tuple nested in itself many times takes for ever.
+        # Keys are flat because hashing a tuple that is nested in itself many times would not end.
         if type(key) not in (str, int):
             raise ValueError(f"{type(key).__name__} as a key")
         target[key] = value
@@ -175,7 +177,7 @@ def _storage(identifier: object) -> Storage:
         case ("storage", _Global(name), str(key), str(), int(count)) if name in STORAGES and count >= 0:
             storage = Storage(key, STORAGES[name], count)
         case _:
-            raise ValueError("a storage that PyTorch does not describe so")
+            raise ValueError("a storage that is not described as PyTorch does")
     if count * jnp.dtype(storage.dtype).itemsize > STORAGE_LIMIT:
         raise Refusal(f"it claims a storage of {count} {storage.dtype} numbers; at most {STORAGE_LIMIT} bytes are read")
     return storage
@@ -186,7 +188,7 @@ def _tensor(storage: Storage, offset: object, shape: tuple, strides: tuple) -> T
     counts = all(type(number) is int and number >= 0 for number in numbers)
     if not counts or len(shape) != len(strides) or len(shape) > DIMENSION_LIMIT:
         raise ValueError("a tensor whose offset, shape or strides are not counts")
-    # No larger than its storage: a stride of 0 could otherwise ask for any amount of memory.
+    # A tensor is no larger than its storage: a stride of 0 could otherwise ask for any amount of memory.
     last = offset + sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True))
     if not 0 < math.prod(shape) <= storage.count or last >= storage.count:
         raise Refusal(

@@ -1,4 +1,4 @@
-"""Vector neurons: rotation-equivariant layers on lists of 3-vectors, and the encoder made of them."""
+"""Vector neurons: rotation-equivariant layers on channels of 3-vectors (Deng et al., Vector Neurons, 2021)."""
 
 import flax.linen as nn
 import jax
@@ -7,28 +7,30 @@ from jaxtyping import Array, Bool, Float
 
 Vectors = tuple[Float[Array, "points channels"], Float[Array, "points channels"], Float[Array, "points channels"]]
 
-
 VECTOR_EPSILON = 1e-6  # added to |d|^2 in the vector leaky ReLU, as in the original
-NEIGHBOUR_ROWS = 2048  # points whose distances to all others exist at a time
+NEIGHBOUR_ROWS = 2048  # points whose distances to all others are in memory at a time
 
 
 class VectorMap(nn.Module):
-    """A linear map of vector channels; no bias, so it commutes with rotations."""
+    """A linear map of vector channels. It has no bias, so it commutes with rotations."""
 
     inputs: int
     outputs: int
 
     def setup(self):
-        # Standard deviation 1/sqrt(inputs) keeps the variance from layer to layer. PyTorch's default is smaller by
-        # sqrt(3); through the encoder's depth that starts the latent at rms 1e-4, and the decoder then sees nothing but
-        # |p|^2.
+        """Make the parameters."""
+        # A standard deviation of 1/sqrt(inputs) keeps the variance from layer to layer. PyTorch's default is smaller by
+        # sqrt(3): through the depth of the encoder the latent then starts at an rms of 1e-4, and the decoder sees
+        # nothing but |p|^2.
         self.kernel = self.param("kernel", nn.initializers.lecun_normal(), (self.inputs, self.outputs))
 
     def __call__(self, x: Vectors) -> Vectors:
+        """The mapped channels."""
         return map_planes(lambda plane: plane @ self.kernel, x)
 
 
 def vector_dot(a, b):
+    """Scalar products of vectors given as planes."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
@@ -37,6 +39,7 @@ def _cross(a, b):
 
 
 def map_planes(function, *planes):
+    """The planes x, y and z that a function makes of those of its arguments."""
     return tuple(function(*plane) for plane in zip(*planes))
 
 
@@ -46,21 +49,23 @@ def _reflection(inner, squared, slope):
 
 
 def _reflect(x, direction, slope):
-    """Vector leaky ReLU: `x` where <x,d> >= 0, else `x` less (1 - slope) of its part along `d`."""
+    """Vector leaky ReLU: `x` where <x,d> >= 0, otherwise `x` minus (1 - slope) times its part along `d`."""
     coefficient = _reflection(vector_dot(x, direction), vector_dot(direction, direction), slope)
     return map_planes(lambda a, d: a - coefficient * d, x, direction)
 
 
 class VectorLinear(nn.Module):
-    """`VectorMap` under the name the published checkpoints give it."""
+    """`VectorMap` under the name that the published checkpoints give it."""
 
     inputs: int
     outputs: int
 
     def setup(self):
+        """Make the map."""
         self.map_to_feat = VectorMap(self.inputs, self.outputs)
 
-    def __call__(self, x):
+    def __call__(self, x: Vectors) -> Vectors:
+        """The mapped channels."""
         return self.map_to_feat(x)
 
 
@@ -71,20 +76,22 @@ class VectorLeakyReLU(nn.Module):
     slope: float
 
     def setup(self):
+        """Make the map to directions."""
         self.map_to_dir = VectorMap(self.channels, self.channels)
 
-    def __call__(self, x):
+    def __call__(self, x: Vectors) -> Vectors:
+        """The activations."""
         return _reflect(x, self.map_to_dir(x), self.slope)
 
 
 class EdgeConvolution(nn.Module):
     """Edge features of the nearest neighbours, a vector linear map, a vector leaky ReLU and the mean over neighbours.
 
-    The edge features of a neighbour are e = neighbour - x, x, and c = neighbour x x = e x x. The (points, neighbours,
-    3, channels) activations are never formed: <feature,d> and |d|^2 are linear in the scalar products of (e, x, c), of
-    which only four differ from zero (c is normal to e and x), and the mean over neighbours needs only the mean of s and
-    of s e, s being the reflection's coefficient: the mean of s x is (mean s) x, that of s c is (mean s e) x x. Equal to
-    the plain form to rounding, and without its memory.
+    The edge features of a neighbour are e = neighbour - x, x, and c = neighbour x x = e x x. This layer never forms the
+    (points, neighbours, 3, channels) activations. <feature,d> and |d|^2 are linear in the scalar products of (e, x, c),
+    of which only four differ from zero, because c is normal to e and x. With s the reflection's coefficient, the mean
+    over neighbours needs only the means of s and of s e: the mean of s x is (mean s) x, and that of s c is
+    (mean s e) x x. The result equals that of the plain form to rounding.
     """
 
     channels: int
@@ -92,12 +99,22 @@ class EdgeConvolution(nn.Module):
     slope: float
 
     def setup(self):
+        """Make both maps."""
         self.map_to_feat = VectorMap(3, self.channels)
         self.map_to_dir = VectorMap(3, self.channels)
 
     def __call__(self, points: Float[Array, "points 3"], used: Bool[Array, " points"] | None = None) -> Vectors:
+        """The mean activations of every point.
+
+        Args:
+            points: point cloud, (points, 3), scaled.
+            used: mask of the points that can be neighbours, (points,); all of them by default.
+
+        Returns:
+            Planes (points, channels).
+        """
         kernels = self.map_to_feat.kernel, self.map_to_dir.kernel
-        # Promoted first: products of float32 kernels would round away what float64 points ask for.
+        # The kernels are promoted before they are multiplied: products in float32 would spoil those of float64 points.
         feature, direction = (kernel.astype(jnp.promote_types(kernel.dtype, points.dtype)) for kernel in kernels)
         own = tuple(points.T)  # planes (points,)
         spread = map_planes(lambda plane: plane[:, None], own)
@@ -111,7 +128,7 @@ class EdgeConvolution(nn.Module):
             vector_dot(spread, spread),
             vector_dot(cross, cross),
         )
-        # Four terms written out, not a matrix product, which is not fused with what follows: 5 ms for 1500 points
+        # The four terms are written out because a matrix product is not fused with what follows: 5 ms for 1500 points
         # instead of 16.
         inner, squared = (
             sum(product[:, :, None] * weight for product, weight in zip(products, _bilinear(kernel, direction)))
@@ -137,24 +154,27 @@ def _bilinear(a, b):
 
 
 def nearest_neighbours(points: Float[Array, "points 3"], count: int, used: Bool[Array, " points"] | None = None):
-    """Indices (points, count) of the nearest points, or of those used, by Euclidean distance, the point itself included."""
+    """Indices of the nearest points by Euclidean distance.
+
+    Args:
+        points: point cloud, (points, 3).
+        count: neighbours of a point, itself included.
+        used: mask of the points that can be neighbours, (points,); all of them by default.
+
+    Returns:
+        Indices, (points, count), nearest first.
+    """
     points = jax.lax.stop_gradient(points)
 
     def nearest(x):
-        # Differences, not |a|^2 + |b|^2 - 2ab: in float32 the latter misorders near neighbours of a cloud far from
-        # zero.
+        # In float32, |a|^2 + |b|^2 - 2ab instead of differences would misorder near neighbours of a cloud that is far
+        # from zero.
         squared = sum((points[:, axis] - x[axis]) ** 2 for axis in range(3))
         squared = squared if used is None else jnp.where(used, squared, jnp.inf)
         return jax.lax.top_k(-squared, count)[1]
 
-    # In blocks, for all distances of a dense cloud do not fit: 6 GB at 40,000 points.
+    # Blocks bound the memory: all distances at once need 6 GB at 40,000 points.
     return jax.lax.map(nearest, points, batch_size=NEIGHBOUR_ROWS)
-
-
-def farthest(points: Float[Array, "points 3"], used: Bool[Array, " points"] | None = None) -> Float[Array, "3"]:
-    """The point of a centred cloud, or of those used, that is farthest from its mean."""
-    squared = jnp.sum(points**2, axis=1)
-    return points[jnp.argmax(squared if used is None else jnp.where(used, squared, -1))]
 
 
 class VectorResidualBlock(nn.Module):
@@ -165,6 +185,7 @@ class VectorResidualBlock(nn.Module):
     slope: float
 
     def setup(self):
+        """Make the layers, under the published names."""
         self.actvn_0 = VectorLeakyReLU(self.inputs, self.slope)
         self.fc_0 = VectorLinear(self.inputs, self.outputs)
         self.actvn_1 = VectorLeakyReLU(self.outputs, self.slope)
@@ -172,9 +193,14 @@ class VectorResidualBlock(nn.Module):
         self.shortcut = VectorLinear(self.inputs, self.outputs)
 
     def __call__(self, x: Vectors, pooled: Vectors | None = None) -> Vectors:
-        """Args: x, and `pooled`, one point's channels to append to every point's, or None."""
-        # What is linear in the pooled half is computed once, not once for every point: 651,000 multiply-adds
-        # a point and axis instead of 847,000.
+        """The output channels.
+
+        Args:
+            x: planes (points, channels).
+            pooled: planes (1, channels) that are appended to the channels of every point; none by default.
+        """
+        # The part that is linear in the pooled half is computed once instead of once for every point: 651,000
+        # multiply-adds a point and axis instead of 847,000.
         direction = _split_map(self.actvn_0.map_to_dir, x, pooled)
         shortcut = _split_map(self.shortcut.map_to_feat, x, pooled)
         if pooled is not None:
@@ -186,7 +212,7 @@ class VectorResidualBlock(nn.Module):
 
 
 def _split_map(linear, x, pooled):
-    """`linear` of [x, pooled] along channels, without forming it."""
+    """`linear` of [x, pooled], joined along channels, without forming that array."""
     if pooled is None:
         return linear(x)
     width = x[0].shape[-1]

@@ -1,4 +1,4 @@
-"""What was computed, kept in a folder: an experiment that was interrupted does only what is missing."""
+"""Computed runs, kept in a folder: an experiment that was interrupted computes only what is missing."""
 
 import dataclasses
 import json
@@ -7,13 +7,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from tdf_jax._internal.files import kept
+from tdf_jax._internal.cache import kept
 from tdf_jax.networks.model import Model, fingerprint
 from tdf_jax.paper.energy_maps import Swept, figure2
 from tdf_jax.paper.runs import Run, imitation
 from tdf_jax.paper.setting import SHAPES, Setting
 
-FORMAT = 2  # of the files, and of what they hold: raised when a run is computed otherwise
+FORMAT = 3  # of the files and their content: raised when a run is computed otherwise
 
 
 class Store:
@@ -21,22 +21,23 @@ class Store:
 
     Args:
         model: the network.
-        directory: receives one .npz for each; its name is a digest of the setting and the weights.
+        directory: existing folder of .npz files, one for each result; their names are digests of the setting and the
+            weights.
     """
 
     def __init__(self, model: Model, directory: Path):
         self.model, self.directory = model, directory
-        # All that a result depends on, so that a folder never mixes what different versions computed.
+        # These values are in every digest, so that a folder never mixes results of different versions.
         self._about = [FORMAT, version("tdf_jax"), fingerprint(model)]
 
     def run(self, setting: Setting) -> Run:
-        """One imitation."""
+        """The run of a setting."""
         return self._kept(
             ["run", setting], lambda: dataclasses.asdict(imitation(self.model, setting)), lambda arrays: Run(**arrays)
         )
 
     def landscapes(self, base: Setting, field: str, count: int) -> dict[str, Swept]:
-        """Figure 2 of one field, see `tdf_jax.paper.energy_maps.figure2`."""
+        """The panels of one field in figure 2, see `tdf_jax.paper.energy_maps.figure2`."""
 
         def swept():
             panels = figure2(self.model, base, field, count)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
-from tdf_jax.geometry.sampling import thin_indices
+from tdf_jax.geometry.sampling import farthest_point_indices
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.planning.distances import (
     ROUNDING,
@@ -168,7 +168,7 @@ def push_clear(
         at = np.interp(np.arange((len(way) - 1) * looks) / looks, np.arange(len(way)), way)
         wanted = required(at).astype(dtype).reshape(len(way) - 1, looks, -1)
         numbers = np.array([config.lever, config.deviation], dtype)
-        spread, u = thin_indices(body, POINTS), _detours(wxyz_xyz, body, config).astype(dtype)
+        spread, u = farthest_point_indices(body, POINTS), _detours(wxyz_xyz, body, config).astype(dtype)
         points = spread
         for slack in SLACK:
             tried = np.resize(body[points], (POINTS, 3))  # one size, so that bodies of all sizes run one program
@@ -219,7 +219,7 @@ def _said(trajectory, found, short, deviation, deep, kept):
         where = (
             f"at pose {row // looks}" if row % looks == 0 else f"between poses {row // looks} and {row // looks + 1}"
         )
-        n = trajectory.poses
+        n = trajectory.num_poses
         remedy = "lower the margin, thin the body, or move an end or the obstacle"
         if short[::looks].min() >= -ROUNDING or n < 7:
             remedy = f"give it more poses, resample(trajectory, {2 * n + 1}), or {remedy}"

@@ -1,4 +1,4 @@
-"""Training the occupancy network.
+"""Training of the occupancy network.
 
 Modules:
     batch: samples of one step
@@ -6,7 +6,7 @@ Modules:
     dataset: labelled objects on disk
     labels: one labelled object
     loop: the training loop
-    objective: what is minimised
-    prefetch: batches drawn ahead
+    objective: the training loss
+    prefetch: batches drawn before the steps that take them
     run_folder: settings, metrics and checkpoint of a run
 """

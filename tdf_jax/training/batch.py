@@ -1,4 +1,4 @@
-"""One optimisation step's samples: pairs of objects as sensors give them, with labelled points and places to recognise."""
+"""Samples of one optimisation step: pairs of objects as sensors give them, labelled points and places to recognise."""
 
 import dataclasses
 import math
@@ -13,53 +13,54 @@ from tdf_jax.geometry.symmetry import about_z, nearest_turn
 from tdf_jax.training.dataset import DataSet
 from tdf_jax.training.labels import BOX_PADDING
 
-DIAGONALS = (0.08, 0.5)  # metres; every draw rescales its pair to a diagonal log-uniform in this range
-USUAL_DIAGONALS = (0.12, 0.25)  # or, half of the time, in this one, a real mug's
-PAIR_SPREAD = 0.15  # objects come in pairs of about one size: each is off the pair's by up to this share
+DIAGONALS = (0.08, 0.5)  # metres; every draw rescales its pair to a diagonal that is log-uniform in this range
+USUAL_DIAGONALS = (0.12, 0.25)  # metres; half of the draws use this range instead, that of real mugs
+PAIR_SPREAD = 0.15  # the objects of a pair have about one size: each differs from the pair's by up to this share
 VALIDATION_DIAGONAL = 0.18  # metres
-DENSE = 2000  # points a complete cloud is thinned from
+DENSE_POINTS = 2000  # points of a complete cloud before farthest-point sampling
 
-# What a sensor does to clouds, at full corruption.
-PARTIAL_SHARE = 0.6  # of the clouds: seen by one, two or four cameras
-SPARSE_SHARE = 0.3  # of the clouds: of `SPARSE_CLOUDS` points before thinning, log-uniform
-SPARSE_CLOUDS = (300, DENSE)
-# of the clouds: normal noise with a standard deviation of up to `NOISE` of the diagonal, 2.5 mm on a real mug
+# Corruptions of clouds by a sensor, at full strength. Shares are of the clouds.
+PARTIAL_SHARE = 0.6  # seen by one, two or four cameras
+SPARSE_SHARE = 0.3  # with a number of points before farthest-point sampling that is log-uniform in `SPARSE_POINTS`
+SPARSE_POINTS = (300, DENSE_POINTS)
+# With normal noise of a standard deviation of up to `NOISE` of the diagonal, which is 2.5 mm on a real mug.
 NOISY_SHARE = 0.3
 NOISE = 0.015
-OUTLIER_SHARE = 0.2  # of the clouds: some points anywhere in the padded box
-OUTLIERS = 0.005  # of the points, at most; thinning by farthest points keeps nearly all: up to 4 % of a thinned cloud
+OUTLIER_SHARE = 0.2  # with some points anywhere in the padded box
+OUTLIERS = 0.005  # largest share of such points; farthest-point sampling keeps nearly all: up to 4 % of a subsample
 
-# Boxes of query points, shown at a place of one object of a pair and offered to the other at the same place and at
-# wrong poses.
-FIRST_SHARE = 0.6  # of the boxes at the first place of an object, a mug's handle; the others share the rest
+# A box of query points is shown at a place of one object of a pair, and offered to the other one at the same place and
+# at wrong poses.
+FIRST_SHARE = 0.6  # share of the boxes at the first place of an object, a mug's handle; the other places share the rest
 BOX_SIDES = (0.25, 0.55)  # of the pair's diagonal
-REMOTE_SHARE = 0.35  # of the boxes: not at the place itself but carried along with it
+REMOTE_SHARE = 0.35  # share of the boxes that are not at the place but fixed to it at a distance
 REMOTE_DISTANCES = (0.1, 1.5)  # of the pair's diagonal, log-uniform
-GLOBAL_SHARE = 0.4  # of the wrong poses: any rotation, any position about the object; the others are near the right one
+# Share of the wrong poses with any rotation and any position about the object; the others are near the right pose.
+GLOBAL_SHARE = 0.4
 GLOBAL_SPREAD = 0.35  # standard deviation of the position, of the diagonal
 NEAR_ANGLES = (3.0, 90.0)  # degrees, log-uniform
 NEAR_DISTANCES = (0.01, 0.3)  # of the pair's diagonal, log-uniform
-# turns about the axis that are tried for a symmetric object's equal poses: all there are, but for round ones, which
-# have any
+# Rotations about the axis that are tried for the equivalent poses of a symmetric object: these are all of them, except
+# of a round object, which has any.
 QUARTERS = 4
-# of the pair's diagonal: root mean square distance of query points from where a symmetric object's right poses have
-# them
-LEAST_WRONG = 0.01
+# Least root mean square distance of a wrong pose's query points from those of all right poses, of the pair's diagonal.
+MIN_WRONG = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
 class Batch:
-    """One optimisation step's pairs of objects; every cloud is centred on its mean, metres, axes canonical.
+    """Pairs of objects of one optimisation step; every object in its canonical axes, relative to its cloud's mean.
 
     Attributes:
-        clouds: one of each object.
-        queries, inside: labelled points, relative to the cloud's mean.
-        centres: origins of the objects' frames, relative to the cloud's mean.
-        fold: symmetry of the objects, see `tdf_jax.symmetry`: it tells which of the frame's axes there are.
-        shown: query points at a place of each object, relative to its mean.
-        offered: the same query points on the pair's other object, relative to that one's mean: first where the place
-            has them there, at `QUARTERS` poses that the object's symmetry makes equal, some of them the same, then at
-            wrong poses.
+        clouds: point clouds, (pairs, 2, points, 3), metres.
+        queries: labelled query points, (pairs, 2, queries, 3), metres.
+        inside: 1 for query points inside the object, 0 outside, (pairs, 2, queries).
+        centres: origins of the objects' frames, (pairs, 2, 3), metres.
+        fold: symmetry of the objects, (pairs, 2), see `tdf_jax.geometry.symmetry`; it determines which axes of the
+            frame exist.
+        shown: query points at a place of each object, (pairs, 2, box, 3), metres.
+        offered: the same query points on the other object of the pair, (pairs, 2, offers, box, 3), metres: first at the
+            `QUARTERS` right poses, which are equivalent by the object's symmetry and may coincide, then at wrong poses.
     """
 
     clouds: Float[np.ndarray, "pairs 2 points 3"]
@@ -79,36 +80,38 @@ def draw(
     queries: int,
     corruption: float,
     box: int,
-    poses: int,
+    num_poses: int,
 ) -> Batch:
     """Draw one batch.
 
     Args:
-        data: the objects.
-        rng: source of chance; a function of the seed and the step, so that a resumed run draws the same.
-        pairs: pairs of objects in it.
-        points: points of every cloud, thinned by farthest points: 256 random ones drown the small asymmetries by which
-            a network finds the object's frame.
-        queries: labelled points of every object.
-        corruption: how far clouds have come from complete ones (0) to what sensors give (1).
-        box: query points of a place.
-        poses: poses they are offered at, the right one, with its equals, counted once.
+        data: objects to draw from.
+        rng: random generator, a function of the seed and the step, so that a resumed run draws the same.
+        pairs: number of pairs of objects.
+        points: points of every cloud. They are a farthest-point subsample: random points drown the small asymmetries by
+            which a network finds the object's frame.
+        queries: labelled query points of every object.
+        corruption: share of what sensors do to clouds, 0 to 1.
+        box: query points in the box at a place.
+        num_poses: candidate poses of the box; the right pose and its equivalents count once.
+
+    Returns:
+        The batch, in float32.
     """
     drawn = []
     for _ in range(pairs):
         diagonal = _log_uniform(rng, USUAL_DIAGONALS if rng.uniform() < 0.5 else DIAGONALS)
         samples = []
         for which in range(2):
-            if which == 0:  # all sources alike, and all kinds of one, however many objects they have
+            if which == 0:  # every source is as likely, and every kind of a source, whatever their numbers of objects
                 kind = _one_of(rng, _one_of(rng, data.sources))
-            # A partner is of the same kind: places mean the same on both, and what leaves one as it is leaves the
-            # other.
+            # A partner is of the same kind: places correspond, and both have the same symmetry.
             index = data.kinds[kind][rng.integers(len(data.kinds[kind]))]
             cloud = thin(_sensed(data, rng, index, corruption, points), points)
             chosen = rng.integers(data.queries.shape[1], size=queries)
             size = diagonal * math.exp(rng.uniform(-PAIR_SPREAD, PAIR_SPREAD))
             samples.append(_sample(data, index, cloud, chosen, size))
-        drawn.append(_pair(rng, samples, diagonal, box, poses))
+        drawn.append(_pair(rng, samples, diagonal, box, num_poses))
     return Batch(*(np.stack(column).astype(np.float32) for column in zip(*drawn)))
 
 
@@ -118,15 +121,15 @@ def _one_of(rng, choices):
 
 def _sensed(data, rng, index, corruption, points):
     """Points of an object as a sensor may give them, at least as many as the cloud needs."""
-    surface, count = data.surface[index], DENSE
+    surface, count = data.surface[index], DENSE_POINTS
     if rng.uniform() < PARTIAL_SHARE * corruption:
-        # Four cameras first; fewer as the corruption grows.
+        # Slight corruption uses four cameras, stronger corruption fewer.
         likely = np.array([1.0, corruption, corruption**2])
         used = rng.choice(data.visible.shape[1], rng.choice([4, 2, 1], p=likely / likely.sum()), replace=False)
         seen = surface[data.visible[index, used].any(axis=0)]
         surface = seen if len(seen) >= points else surface
     if rng.uniform() < SPARSE_SHARE * corruption:
-        count = int(_log_uniform(rng, SPARSE_CLOUDS))
+        count = int(_log_uniform(rng, SPARSE_POINTS))
     cloud = rng.permutation(surface)[: max(points, count)]
     if rng.uniform() < NOISY_SHARE * corruption:
         cloud = cloud + rng.normal(size=cloud.shape) * rng.uniform(0, NOISE)
@@ -137,13 +140,18 @@ def _sensed(data, rng, index, corruption, points):
     return cloud
 
 
-def validation_pairs(data: DataSet, points: int, box: int, poses: int, one_view: bool) -> list[Batch]:
-    """Objects in pairs of a kind, for measuring: a diagonal of `VALIDATION_DIAGONAL`, all uniform queries.
+def validation_pairs(data: DataSet, points: int, box: int, num_poses: int, one_view: bool) -> list[Batch]:
+    """Pairs of validation objects of one kind, at a diagonal of `VALIDATION_DIAGONAL`, with all uniform queries.
 
     Args:
-        data: the objects.
-        points, box, poses: as in `draw`.
-        one_view: clouds of what the first camera sees, not complete ones.
+        data: validation objects.
+        points: points of every cloud.
+        box: query points in the box at a place.
+        num_poses: candidate poses of the box; the right pose and its equivalents count once.
+        one_view: whether clouds are what the first camera sees, instead of complete ones.
+
+    Returns:
+        One batch without a pairs axis for every pair, in float32.
     """
     samples = []
     for index in data.pairs().ravel():
@@ -152,13 +160,13 @@ def validation_pairs(data: DataSet, points: int, box: int, poses: int, one_view:
         samples.append(_sample(data, index, thin(surface, points), queries, VALIDATION_DIAGONAL))
     rng = np.random.default_rng(0)
     pairs = [
-        _pair(rng, pair, VALIDATION_DIAGONAL, box, poses) for pair in zip(samples[::2], samples[1::2], strict=True)
+        _pair(rng, pair, VALIDATION_DIAGONAL, box, num_poses) for pair in zip(samples[::2], samples[1::2], strict=True)
     ]
     return [Batch(*(np.asarray(field, np.float32) for field in pair)) for pair in pairs]
 
 
 class _Sample(NamedTuple):
-    """One object of a batch, centred on its cloud's mean, metres."""
+    """One object of a batch, relative to its cloud's mean, metres."""
 
     cloud: np.ndarray
     queries: np.ndarray
@@ -176,8 +184,8 @@ def _sample(data, index, cloud, chosen, size):
     return _Sample((cloud - origin) * size, queries, inside, -origin * size, int(data.fold[index]), places)
 
 
-def _pair(rng, samples, diagonal, box, poses):
-    """The fields of `Batch`: two samples of a kind, and query points shown at a place of each and offered to the other."""
+def _pair(rng, samples, diagonal, box, num_poses):
+    """The fields of `Batch`: two samples of one kind, query points at a place of each, and these on the other one."""
     shown, offered = [], []
     for a, b in (samples, samples[::-1]):
         place = 0 if rng.uniform() < FIRST_SHARE else rng.integers(1, len(a.places))
@@ -188,7 +196,7 @@ def _pair(rng, samples, diagonal, box, poses):
             T_place_query[:3, 3] = _direction(rng) * _log_uniform(rng, REMOTE_DISTANCES) * diagonal
         shown.append(_apply(a.places[place] @ T_place_query, x))
         right = b.places[place] @ T_place_query
-        wrong = [_unlike(rng, right, diagonal, x, b) for _ in range(poses - 1)]
+        wrong = [_unlike(rng, right, diagonal, x, b) for _ in range(num_poses - 1)]
         offered.append([_apply(T, x) for T in (*_equals(right, b), *wrong)])
     fields = (
         np.stack([getattr(sample, name) for sample in samples])
@@ -198,7 +206,7 @@ def _pair(rng, samples, diagonal, box, poses):
 
 
 def _equals(right, target):
-    """The right pose after each quarter turn about the target's axis; turns that its symmetry does not allow are replaced by none."""
+    """The right pose after every quarter turn about the target's axis that its symmetry allows; otherwise unchanged."""
     T_mean_object = np.eye(4)
     T_mean_object[:3, 3] = target.centre
     turned = [
@@ -209,25 +217,25 @@ def _equals(right, target):
 
 
 def _unlike(rng, right, diagonal, x, target):
-    """A pose that no symmetry of the target makes a right one: turned about its axis, a round bowl looks the same."""
+    """A wrong pose that is not equivalent to the right one: a rotation of a round bowl about its axis would be."""
     while True:
         wrong = _wrong(rng, right, diagonal)
         if target.fold == 1:
             return wrong
         there, here = (_apply(T, x) - target.centre for T in (wrong, right))
         nearest = here @ about_z(nearest_turn(there, here, target.fold))[:3, :3].T
-        if np.sqrt(np.mean(np.sum((there - nearest) ** 2, axis=1))) > LEAST_WRONG * diagonal:
+        if np.sqrt(np.mean(np.sum((there - nearest) ** 2, axis=1))) > MIN_WRONG * diagonal:
             return wrong
 
 
 def _wrong(rng, right, diagonal):
-    """A pose away from the right one: turned about the query frame's own origin, and shifted."""
+    """A pose that differs from the right one by a rotation about the query frame's origin and a translation."""
     wrong = right.copy()
     if rng.uniform() < GLOBAL_SHARE:
         wrong[:3, :3] = Rotation.random(random_state=rng).as_matrix()
         wrong[:3, 3] = right[:3, 3] * rng.uniform(0, 1) + rng.normal(size=3) * GLOBAL_SPREAD * diagonal
         return wrong
-    kind = rng.integers(3)  # turned, shifted, both
+    kind = rng.integers(3)  # rotated, translated, both
     if kind != 1:
         angle = np.radians(_log_uniform(rng, NEAR_ANGLES))
         wrong[:3, :3] = Rotation.from_rotvec(angle * _direction(rng)).as_matrix() @ right[:3, :3]

@@ -1,9 +1,9 @@
-"""Data sets: many labelled objects in a folder of shards; building one is resumable and a function of its recipe."""
+"""Data sets of labelled objects in a folder of shards; building one can be resumed and depends only on its recipe."""
 
 import concurrent.futures
 import contextlib
 import dataclasses
-import hashlib
+import functools
 import json
 import multiprocessing
 import signal
@@ -15,6 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from tqdm import tqdm
 
+from tdf_jax._internal import checks
+from tdf_jax._internal.cache import digest
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
 from tdf_jax.geometry.symmetry import FOLDS
@@ -24,33 +26,34 @@ from tdf_jax.shapes import FAMILIES
 from tdf_jax.training.labels import UNIFORM_SHARE, Labelled, canonical_mesh, generated_object, scanned_object
 
 MANIFEST = "dataset.json"
-SHARD = 50  # objects in a file, 9 MB: what a kill can lose
+SHARD = 50  # objects in a file of 9 MB, which is what an interruption can lose
 SPLITS = ("training", "validation")
 VALIDATION_SEED = 1_000_003  # added to the recipe's seed; objects are a function of (seed, index)
-BITS = "inside", "visible"  # fields kept as single bits
-HELD_OUT = 10  # one mesh file in so many is kept for validation, at least one
-UNIT_SPREAD = 20.0  # largest diagonal over the smallest in a folder; more means that units are mixed
+BITS = "inside", "visible"  # fields stored as single bits
+HELD_OUT = 10  # one mesh file in so many is held out for validation, at least one
+UNIT_SPREAD = 20.0  # largest diagonal over the smallest in a folder; a larger ratio means that units are mixed
 
 
 @dataclasses.dataclass(frozen=True)
 class Recipe:
-    """What a data set is made of; by default the generated mugs of the shipped mug network.
+    """Settings of a data set; the defaults are the generated mugs of the shipped mug network.
 
     Attributes:
-        seed: of every draw; disjoint seeds give disjoint generated objects.
-        objects: training objects. Of a folder of meshes, every mesh is used in turn, from the second time on stretched.
-        validation: validation objects, even. Of a folder, they are made from the tenth of the meshes that is held out.
+        seed: seed of every draw; different seeds give different generated objects.
+        objects: number of training objects. Every mesh of a folder is used in turn, and stretched from the second time
+            on.
+        validation: number of validation objects, even. Those of a folder are made from its held-out meshes, a tenth.
         points: surface points of an object.
         queries: labelled query points of an object, half uniform in the padded bounding box, half near the surface.
-        cameras: around an object, from which partial clouds are seen.
-        category: family of generated objects: mug, bowl or bottle.
-        meshes: folder of aligned meshes of one category, in place of generated objects.
+        cameras: cameras around an object, from which partial clouds are seen.
+        category: category of generated objects: mug, bowl or bottle.
+        meshes: folder of aligned meshes of one category, instead of generated objects.
         unit: metres per unit of the mesh files.
-        up: their axis that points up.
-        front: their axis towards what tells the object's side, such as a mug's handle, or along their longer side.
-        fold: their symmetry about the axis that points up: 1 none, 2 half turns, 4 quarters, 0 any turn leaves them as
-            they are.
-        stretch: repeated meshes are scaled along every axis by up to e to this, at random.
+        up: axis of the mesh files that points up.
+        front: axis of the mesh files that points to the front, such as a mug's handle, or along a longer side.
+        fold: symmetry of the meshes about the up axis: 1 none; 2 half turns, 4 quarter turns, 0 all turns leave them
+            unchanged.
+        stretch: repeated meshes are scaled along every axis by a random factor of up to e to this.
     """
 
     seed: int = 0
@@ -68,32 +71,28 @@ class Recipe:
     stretch: float = 0.15
 
     def __post_init__(self):
-        least = {"seed": 0, "objects": 1, "validation": 2, "points": 100, "queries": 100, "cameras": 4}
-        for name, low in least.items():
-            if getattr(self, name) < low:
-                raise InputError(f"Recipe(): {name} is {getattr(self, name)}; expected at least {low}")
-        if self.category not in FAMILIES:
-            raise InputError(f"Recipe(): category is {self.category!r}; expected one of {', '.join(FAMILIES)}")
+        lowest = {"seed": 0, "objects": 1, "validation": 2, "points": 100, "queries": 100, "cameras": 4}
+        for name, low in lowest.items():
+            checks.count("Recipe()", name, getattr(self, name), low)
+        checks.choice("Recipe()", "category", self.category, FAMILIES)
         if self.fold not in FOLDS:
             raise InputError(f"Recipe(): fold is {self.fold}; expected one of {', '.join(map(str, FOLDS))}")
         if self.meshes is None and self.fold != 1:
-            raise InputError("Recipe(): fold is for meshes; generated objects know theirs; drop it")
+            raise InputError("Recipe(): fold is for meshes; generated objects have their own; omit it")
         if self.validation % 2:
             raise InputError(
                 f"Recipe(): validation is {self.validation}; expected an even number, objects come in pairs"
             )
-        if not 0 < self.unit < np.inf:
-            raise InputError(f"Recipe(): unit is {self.unit}; expected metres per unit of the files, such as 0.001")
-        if not 0 <= self.stretch <= 1:
-            raise InputError(f"Recipe(): stretch is {self.stretch}; expected 0 to 1")
+        checks.positive("Recipe()", "unit", self.unit, unit="metres per unit of the files, such as 0.001")
+        checks.number("Recipe()", "stretch", self.stretch, 0, 1)
         file_axes(self.up, self.front)
 
 
 @dataclasses.dataclass(frozen=True)
 class DataSet:
-    """Objects in their canonical frame (up +z, front, handle or long side +x), scaled to unit diagonal; fields as in `Labelled`.
+    """Objects in their canonical frame (up +z; front, handle or long side +x), scaled to a diagonal of 1.
 
-    `source` tells which of several data sets an object is from.
+    The fields are those of `Labelled`, with an axis of objects. `source` numbers the data set that an object is from.
     """
 
     surface: Float[np.ndarray, "objects points 3"]
@@ -107,51 +106,51 @@ class DataSet:
 
     @property
     def uniform(self) -> slice:
-        """The queries that are uniform in the padded box."""
+        """Slice of the query points that are uniform in the padded box."""
         return slice(0, int(self.queries.shape[1] * UNIFORM_SHARE))
 
     @cached_property
     def sources(self) -> list[list[int]]:
-        """Of each source, the numbers of its kinds in `kinds`."""
+        """Numbers in `kinds` of the kinds of every source."""
         source = [self.source[members[0]] for members in self.kinds]
         return [np.flatnonzero(source == one).tolist() for one in np.unique(source)]
 
     @cached_property
     def kinds(self) -> list[Int[np.ndarray, " members"]]:
-        """Indices of the objects of each kind, one source and symmetry: places mean the same on all of them."""
+        """Indices of the objects of every kind; they share a source and a symmetry, and their places correspond."""
         kinds = np.stack([self.source, self.fold], axis=1)
         return [np.flatnonzero((kinds == kind).all(axis=1)) for kind in np.unique(kinds, axis=0)]
 
     @cached_property
     def kind(self) -> Int[np.ndarray, " objects"]:
-        """Of every object, the number of its kind in `kinds`."""
+        """Number in `kinds` of every object's kind."""
         kind = np.empty(len(self.fold), int)
         for number, members in enumerate(self.kinds):
             kind[members] = number
         return kind
 
     def pairs(self) -> Int[np.ndarray, "pairs 2"]:
-        """Every object with another of its kind; of an odd number the last is left out."""
+        """Every object paired with another of its kind; without the last one of an odd number."""
         return np.concatenate([members[: len(members) // 2 * 2].reshape(-1, 2) for members in self.kinds])
 
     def digest(self) -> str:
-        """A name for the contents, by which a resumed run knows its data again."""
-        # runs on mugs keep the names they had
+        """Digest of the contents, by which a resumed run recognises its data."""
+        # Data sets without symmetry keep the digests that they had before there were others.
         symmetry = b"" if (self.fold == 1).all() else self.fold.astype(np.int8).tobytes()
-        return hashlib.sha256(self.surface.tobytes() + self.inside.tobytes() + symmetry).hexdigest()[:16]
+        return digest(self.surface, self.inside, symmetry)[:16]
 
 
 def build(recipe: Recipe, directory: str | Path, workers: int = 1, progress: bool = True) -> None:
-    """Label the objects of a recipe into a folder, or go on where an interrupted call stood.
+    """Label the objects of a recipe into a folder, or resume an interrupted call.
 
     Args:
-        recipe: what to build.
-        directory: receives `dataset.json` and a .npz file for every `SHARD` objects.
-        workers: processes.
-        progress: show a progress bar.
+        recipe: settings of the data set.
+        directory: folder that receives `dataset.json` and a .npz file for every `SHARD` objects.
+        workers: number of processes.
+        progress: whether to show a progress bar.
 
     Raises:
-        InputError: the recipe's meshes will not do, or the folder holds another data set or cannot be written.
+        InputError: meshes of the recipe are not valid, or the folder holds another data set or cannot be written.
     """
     directory = Path(directory)
     splits = _mesh_files(recipe)
@@ -180,43 +179,45 @@ def build(recipe: Recipe, directory: str | Path, workers: int = 1, progress: boo
 
 
 def load(directory: str | Path) -> tuple[DataSet, DataSet]:
-    """Read a data set: its training and its validation objects.
+    """Read the training and the validation objects of a data set.
 
     Args:
-        directory: from `build`.
+        directory: folder from `build`.
 
     Raises:
-        InputError: there is none, it is not finished, or a file of it is damaged.
+        InputError: the folder holds no data set, an unfinished one, or a damaged file.
     """
     directory = Path(directory)
     if not (directory / MANIFEST).exists():
         raise InputError(f"load(): {directory} has no {MANIFEST}; expected a folder made by tdf dataset")
     recipe = _read(directory / MANIFEST, lambda file: Recipe(**json.load(file)["recipe"]))
-    parts = {split: [] for split in SPLITS}
+    parts: dict[str, list[Labelled]] = {split: [] for split in SPLITS}
     for name, split, indices in _shards(recipe):
         if not (directory / name).exists():
             raise InputError(
-                f"load(): {directory} has no {name}; the data set is not finished: run its tdf dataset command again"
+                f"load(): {directory} has no {name}; the data set is not finished. Run its tdf dataset command again"
             )
-        parts[split].append(_read(directory / name, lambda file, count=len(indices): _unpacked(file, recipe, count)))
-    return tuple(_collected(parts[split]) for split in SPLITS)
+        unpacked = functools.partial(_unpacked, recipe=recipe, count=len(indices))
+        parts[split].append(_read(directory / name, unpacked))
+    training, validation = (_collected(parts[split]) for split in SPLITS)
+    return training, validation
 
 
 def joined(sets: Sequence[DataSet]) -> DataSet:
-    """Several data sets as one, for a network of several categories; `source` numbers them.
+    """Join data sets for a network of several categories; `source` numbers them.
 
     Args:
-        sets: from `load`, with as many points, queries, cameras and places an object.
+        sets: data sets from `load`, whose objects have the same numbers of points, queries, cameras and places.
 
     Raises:
-        InputError: they differ in these.
+        InputError: these numbers differ.
     """
     shapes = [{name: getattr(one, name).shape[1:] for name in Labelled._fields} for one in sets]
     different = [name for name in shapes[0] if any(shape[name] != shapes[0][name] for shape in shapes)]
     if different:
         raise InputError(
-            f"joined(): the data sets differ in {', '.join(different)}; expected as many points, queries, cameras and places an object in each: "
-            "build them with the same options"
+            f"joined(): the data sets differ in {', '.join(different)}; expected the same numbers of points, queries, "
+            "cameras and places an object. Build them with the same options"
         )
     columns = {name: np.concatenate([getattr(one, name) for one in sets]) for name in Labelled._fields}
     return DataSet(**columns, source=np.repeat(np.arange(len(sets)), [len(one.fold) for one in sets]))
@@ -228,7 +229,7 @@ def _collected(parts) -> DataSet:
 
 
 def _shards(recipe):
-    """(file name, split, indices) of every shard."""
+    """File name, split and indices of every shard."""
     for split, count in zip(SPLITS, (recipe.objects, recipe.validation)):
         for start in range(0, count, SHARD):
             yield f"{split}-{start // SHARD:04d}.npz", split, range(start, min(start + SHARD, count))
@@ -253,13 +254,13 @@ def _read(path, parse):
     except Exception as error:  # damaged files raise whatever their parser stumbles on
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(
-            f"load(): {path} cannot be read ({reason}); delete that file and run the tdf dataset command again: "
-            "it makes only what is missing"
+            f"load(): {path} cannot be read ({reason}); delete that file and run the tdf dataset command again, "
+            "which makes only what is missing"
         ) from None
 
 
 def _claimed(directory, manifest):
-    """Whether this data set was begun here before; another one is refused."""
+    """Whether the folder holds this data set, finished or not; another data set is refused."""
     if not (directory / MANIFEST).exists():
         return False
     old = _read(directory / MANIFEST, lambda file: dict(json.load(file)))
@@ -276,7 +277,7 @@ def _claimed(directory, manifest):
 
 
 def _mesh_files(recipe) -> dict[str, list[Path]]:
-    """The mesh files of each split; none for a generated family."""
+    """Mesh files of each split; none for generated objects."""
     if recipe.meshes is None:
         return {split: [] for split in SPLITS}
     folder = Path(recipe.meshes)
@@ -292,7 +293,7 @@ def _mesh_files(recipe) -> dict[str, list[Path]]:
 
 
 def _check_meshes(recipe, files, progress):
-    """Every mesh must load and enclose a volume, and all must be of about one size."""
+    """Check that every mesh loads and encloses a volume, and that their sizes have one unit."""
     if not files:
         return
     libigl("tdf dataset")
@@ -307,18 +308,18 @@ def _check_meshes(recipe, files, progress):
     if problems:
         listed = "\n  ".join(problems)
         raise InputError(
-            f"tdf dataset: {len(problems)} of {len(files)} meshes will not do; mend them or take them out:\n  {listed}"
+            f"tdf dataset: {len(problems)} of {len(files)} meshes are not valid; repair or remove them:\n  {listed}"
         )
-    small, large = min(diagonals, key=diagonals.get), max(diagonals, key=diagonals.get)
+    small, large = min(diagonals, key=diagonals.__getitem__), max(diagonals, key=diagonals.__getitem__)
     if diagonals[large] > UNIT_SPREAD * diagonals[small]:
         raise InputError(
-            f"tdf dataset: {small} measures {diagonals[small]:.3g} m across and {large} {diagonals[large]:.3g} m; expected one unit in all "
-            "files: rescale some"
+            f"tdf dataset: {small} measures {diagonals[small]:.3g} m across and {large} {diagonals[large]:.3g} m; "
+            "expected one unit in all files. Rescale some"
         )
 
 
 def _label(task) -> Labelled:
-    """One object; a function of the recipe, the split and the index alone."""
+    """Label one object, which depends on the recipe, the split and the index only."""
     recipe, files, split, index = task
     rng = np.random.default_rng([recipe.seed + (VALIDATION_SEED if split == "validation" else 0), index])
     counts = recipe.points, recipe.queries, recipe.cameras
@@ -330,15 +331,15 @@ def _label(task) -> Labelled:
 
 @contextlib.contextmanager
 def _mapped(function, tasks, workers):
-    """Results in the order of the tasks; processes are started afresh, for a forked copy of a threaded one may hang."""
+    """Results in the order of the tasks; processes are spawned because a forked copy of a threaded one may hang."""
     if workers < 2 or len(tasks) < 2:
         yield map(function, tasks)
         return
     context = multiprocessing.get_context("spawn")
-    # Ctrl-C reaches every process of the terminal: this one answers it, the others would only add their tracebacks.
+    # Ctrl-C reaches every process of the terminal. This one handles it; the others would only print tracebacks.
     ignore = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
     with concurrent.futures.ProcessPoolExecutor(workers, context, **ignore) as pool:
         try:
             yield pool.map(function, tasks)
         finally:
-            pool.shutdown(cancel_futures=True)  # without it, an interruption waits for everything that was asked for
+            pool.shutdown(cancel_futures=True)  # otherwise an interruption waits for all submitted tasks

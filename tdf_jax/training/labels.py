@@ -1,4 +1,4 @@
-"""One object as training sees it: surface points, labelled query points, what cameras see, and its places."""
+"""One labelled object: surface points, query points inside and outside, points that cameras see, and places."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,24 +15,25 @@ from tdf_jax.geometry.winding import inside, winding_number
 from tdf_jax.io.meshes import file_axes, load_mesh
 from tdf_jax.shapes import FAMILIES
 
-UNIFORM_SHARE = 0.5  # of the query points: uniform in the padded bounding box; the rest lie near the surface
+UNIFORM_SHARE = 0.5  # of the query points are uniform in the padded bounding box; the others lie near the surface
 BOX_PADDING = 0.10  # of the diagonal, on every side
-# Half of the points near the surface lie within a wall's thickness of it (2 mm on a real mug), half further out.
+# Half of the points near the surface lie within the thickness of a wall (2 mm on a real mug), half further away.
 NEAR_SPREADS = (0.012, 0.05)  # standard deviations, of the diagonal
-LEAST_INSIDE = 0.002  # of the uniform query points; real mugs have 0.07 to 0.09, a thin bowl 0.008
+MIN_INSIDE = 0.002  # share of the uniform query points; real mugs have 0.07 to 0.09, a thin bowl 0.008
 
 
 class Labelled(NamedTuple):
-    """An object in its canonical frame (up +z, front, handle or long side +x), scaled to unit diagonal.
+    """An object in its canonical frame (up +z; front, handle or long side +x), scaled to a diagonal of 1.
 
     Attributes:
-        surface: uniform by area.
-        queries: the first half uniform in the padded bounding box, the rest near the surface.
-        inside: which queries are.
-        visible: which surface points each of some cameras all around sees.
-        places: T_object_place of places that mean the same on every object.
-        diagonal: metres, of the object before it was scaled.
-        fold: its symmetry about z, see `tdf_jax.symmetry`.
+        surface: surface points, uniform by area, (points, 3).
+        queries: query points, (queries, 3); the first half is uniform in the padded bounding box, the others are near
+            the surface.
+        inside: whether each query point is inside, (queries,).
+        visible: whether each camera sees each surface point, (cameras, points).
+        places: poses T_object_place of places that correspond on all objects, (places, 4, 4).
+        diagonal: diagonal of the object before it was scaled, metres.
+        fold: symmetry about z, see `tdf_jax.geometry.symmetry`.
     """
 
     surface: Float[np.ndarray, "points 3"]
@@ -45,7 +46,7 @@ class Labelled(NamedTuple):
 
 
 def generated_object(category: str, rng: np.random.Generator, points: int, queries: int, cameras: int) -> Labelled:
-    """An object of one of the library's own families with its family's places."""
+    """A generated object of a category of `tdf_jax.shapes`, with the places of its family."""
     family = FAMILIES[category]
     shape = family.build(family.sample(rng))
     places = np.stack([shape.frames[name] for name in family.places])
@@ -63,15 +64,17 @@ def scanned_object(
 ) -> Labelled:
     """A user's mesh, watertight or not, labelled by the generalised winding number.
 
-    Its places are the middle of the bounding box and of its six faces, axes as the object's.
+    Its places are the centres of the bounding box and of its six faces, with the axes of the object.
 
     Args:
-        mesh: from `canonical_mesh`.
-        rng: source of chance.
-        points, queries, cameras: how many.
-        stretch: every axis is scaled by up to e to this, at random; 0 leaves the mesh as it is.
-        fold: symmetry of the mesh; of one that looks the same after quarter turns or any, x and y are stretched alike,
-            so that it stays so.
+        mesh: mesh from `canonical_mesh`, metres.
+        rng: random generator.
+        points: number of surface points.
+        queries: number of query points.
+        cameras: number of cameras.
+        stretch: every axis is scaled by a random factor of up to e to this; 0 does not scale.
+        fold: symmetry of the mesh. If quarter turns or all turns leave it unchanged, x and y are scaled alike, so that
+            the symmetry remains.
     """
     mesh, factors = mesh.copy(), np.exp(rng.uniform(-stretch, stretch, 3))
     mesh.apply_scale(factors if fold in (1, 2) else factors[[0, 0, 2]])
@@ -100,15 +103,16 @@ def _labelled(mesh, contains, places, fold, rng, points, queries, cameras):
 
 
 def canonical_mesh(path, unit: float, up: str, front: str) -> "trimesh.Trimesh":
-    """A mesh file in metres, up +z, front +x, checked to enclose a volume.
+    """Read a mesh file, in metres, with up +z and front +x, and check that it encloses a volume.
 
     Args:
-        path: .obj, .stl, .ply, .off, .glb.
+        path: .obj, .stl, .ply, .off or .glb file.
         unit: metres per unit of the file.
-        up, front: axes of the file, such as "+z" and "-x".
+        up: axis of the file that points up, such as "+z".
+        front: axis of the file that points to the front, such as "-x".
 
     Raises:
-        InputError: the file is no mesh, or encloses nothing, or has holes too large to tell inside from outside.
+        InputError: the file is not a mesh, encloses nothing, or has holes too large to distinguish inside and outside.
     """
     mesh = load_mesh(path, scale=unit)
     mesh.vertices = mesh.vertices @ file_axes(up, front)
@@ -116,14 +120,14 @@ def canonical_mesh(path, unit: float, up: str, front: str) -> "trimesh.Trimesh":
     pad = BOX_PADDING * np.linalg.norm(mesh.extents)
     x = np.random.default_rng(0).uniform(mesh.bounds[0] - pad, mesh.bounds[1] + pad, (4000, 3))
     enclosed = inside(mesh, x)
-    if enclosed is None or enclosed.mean() < LEAST_INSIDE:
+    if enclosed is None or enclosed.mean() < MIN_INSIDE:
         got = (
             "is open: much of its bounding box is neither inside nor outside"
             if enclosed is None
-            else "encloses next to nothing"
+            else "encloses almost no volume"
         )
         raise InputError(
-            f"canonical_mesh(): {path} {got}; expected a closed surface, or one with small holes, of a solid with walls: "
-            "give it thickness, or leave it out"
+            f"canonical_mesh(): {path} {got}; expected a closed surface, or one with small holes, of a solid "
+            "with walls. Give it thickness, or leave it out"
         )
     return mesh

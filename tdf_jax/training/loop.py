@@ -1,8 +1,7 @@
-"""The training loop: deterministic, and resumable to the same numbers."""
+"""The training loop: deterministic, and resumable with the same numbers."""
 
 import dataclasses
 import functools
-import hashlib
 import json
 import time
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import optax
 from tqdm import tqdm
 
+from tdf_jax._internal.cache import digest
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.cases import Transfer, random_pose
 from tdf_jax.evaluation.pick_transfer import place_errors, transferred
@@ -23,14 +23,14 @@ from tdf_jax.training.batch import VALIDATION_DIAGONAL, Batch, draw, validation_
 from tdf_jax.training.config import TrainConfig
 from tdf_jax.training.dataset import DataSet
 from tdf_jax.training.objective import FRONT, UP, mean_gradient, pair_loss
-from tdf_jax.training.prefetch import asked_ahead, drawn_ahead
+from tdf_jax.training.prefetch import num_prefetched, prefetched
 from tdf_jax.training.run_folder import METRICS, claim, drop_later_metrics, restore, save
 
-CORRUPTING = (0.1, 0.6)  # shares of the run
+CORRUPTION_RISE = (0.1, 0.6)  # shares of the run between which the corruption grows
 VALIDATION_BOX, VALIDATION_POSES = 128, 33
-TRANSFERS, TRANSFER = 8, OptimizeConfig(inits=4, iterations=60)  # fewer than an evaluation has: for the trend
+TRANSFERS, TRANSFER = 8, OptimizeConfig(num_starts=4, iterations=60)  # fewer than in an evaluation: they show the trend
 TIMED_STEPS = 6
-AVERAGED = 0.1  # the weights a run gives are averaged over about this share of its steps, the latest
+AVERAGED = 0.1  # the weights that a run gives are averaged over about this share of its steps, the latest ones
 
 
 def train(
@@ -42,40 +42,43 @@ def train(
     progress: bool = True,
     workers: int = 1,
 ) -> dict:
-    """Train, or resume where the checkpoint in `directory` stands, to `config.steps`.
+    """Train, or resume from the checkpoint in `directory`, up to `config.steps`.
 
-    Every step's draw is a function of (seed, step), so a resumed run takes the steps an uninterrupted one would.
+    Every step's batch is a function of the seed and the step, so a resumed run takes the same steps as an uninterrupted
+    one.
 
     Args:
-        config: settings.
-        data: the objects to train on.
-        validation: others, to measure by.
-        directory: receives `state.msgpack`, `metrics.jsonl` and `config.json`. A run that stands there with other
-            settings, data or initial parameters is refused, except that `steps` may change.
-        initial: parameters of a network to go on from, with `config.network` that of its model; random ones by default.
-            Clouds then are as sensors give them from the first step: a network that knew one view unlearned it while
-            clouds were complete (IoU 0.48 to 0.08 in 500 steps).
-        progress: show a progress bar.
-        workers: processes that draw batches, which do not depend on how many there are; 1 is a thread of this one.
+        config: settings of the run.
+        data: objects to train on.
+        validation: other objects, for validation.
+        directory: folder that receives `state.msgpack`, `metrics.jsonl` and `config.json`. A folder with a run of other
+            settings, data or initial parameters is refused, except that `steps` may differ.
+        initial: parameters of a network to start from, whose sizes are `config.network`; random ones by default. With
+            them clouds are corrupted from the first step, because a network that knows one view unlearns it on complete
+            clouds (docs/results/code_notes.md).
+        progress: whether to show a progress bar.
+        workers: number of processes that draw batches, on which the batches do not depend; 1 is a thread of this
+            process.
 
     Returns:
-        The network's parameters, averaged over about the last tenth of the steps, as validation measures them: at a
-        high learning rate they are far better than the latest, so a run's state is of use at any time.
+        Parameters of the network, averaged over about the last tenth of the steps. Validation measures these too: at a
+        high learning rate they are much better than the latest parameters, so a run can be used at any time.
 
     Raises:
         InputError: the data have too few points, or the directory holds another run or cannot be written.
-        FloatingPointError: the loss is no longer finite.
+        FloatingPointError: the loss is not finite.
     """
     directory = Path(directory)
     seen = int(validation.visible[:, 0].sum(axis=1).min())
     if min(seen, data.surface.shape[1]) < config.points:
         raise InputError(
-            f"train(): points is {config.points}, but a camera sees {seen} of an object's {data.surface.shape[1]} surface points; "
-            "expected no more than it sees: lower points, or build the data set with more"
+            f"train(): points is {config.points}, but a camera sees {seen} of an object's {data.surface.shape[1]} "
+            "surface points; expected no more than it sees. Lower points, or build the data set with more"
         )
     if not len(validation.pairs()):
         raise InputError(
-            "train(): no two validation objects are of one data set and symmetry; expected at least a pair; build the data set with more (--validation)"
+            "train(): no two validation objects have the same data set and symmetry; expected at least a pair. "
+            "Build the data set with more (--validation)"
         )
     claim(directory, dataclasses.asdict(config) | {"data": data.digest(), "initial": _digest(initial)})
     measured = {
@@ -89,7 +92,7 @@ def train(
 
     saved = began = time.monotonic()
     batch = functools.partial(batch_of, config, gradual=initial is None)
-    with drawn_ahead(batch, data, start, workers) as batches, (directory / METRICS).open("a") as metrics:
+    with prefetched(batch, data, start, workers) as batches, (directory / METRICS).open("a") as metrics:
         bar = tqdm(range(start, config.steps), initial=start, total=config.steps, desc="training", disable=not progress)
         for step in bar:
             params, state, parts = _step(
@@ -114,21 +117,23 @@ def train(
 
 
 def steps_within(minutes: float, config: TrainConfig, data: DataSet, workers: int = 1) -> int:
-    """How many steps a run of so many minutes has time for, from the time of a few on this machine.
+    """Number of steps that fit into some minutes, from the time of a few steps on this machine.
 
     Args:
-        minutes: for the steps; a tenth is kept for validations.
-        config, data, workers: of the run.
+        minutes: minutes of the run, a tenth of which is for validations.
+        config: settings of the run.
+        data: objects to train on.
+        workers: number of processes that draw batches.
 
     Raises:
-        InputError: there is no time for more steps than `config.warmup`.
+        InputError: the time is not sufficient for more steps than `config.warmup`.
     """
     optimiser = _optimiser(config)
     params, state = _start(config, data, optimiser, None)
     times = []
-    # drawn while the first step compiles: the steps that take them do not wait for samples
-    waiting = asked_ahead(workers)
-    with drawn_ahead(functools.partial(batch_of, config), data, 0, workers) as batches:
+    # These batches are drawn while the first step compiles, so the steps that take them do not wait and are not timed.
+    waiting = num_prefetched(workers)
+    with prefetched(functools.partial(batch_of, config), data, 0, workers) as batches:
         for step in range(waiting + TIMED_STEPS):
             began = time.monotonic()
             params, state, _ = _step(params, state, dataclasses.astuple(next(batches)), step, config.network, optimiser)
@@ -138,13 +143,14 @@ def steps_within(minutes: float, config: TrainConfig, data: DataSet, workers: in
     steps = int(0.9 * 60 * minutes / seconds)
     if steps <= config.warmup:
         raise InputError(
-            f"train(): {minutes} minutes are enough for {steps} steps of {seconds:.2f} s; expected time for more than {config.warmup}"
+            f"train(): {minutes} minutes are sufficient for {steps} steps of {seconds:.2f} s; expected time for more "
+            f"than {config.warmup}"
         )
     return steps
 
 
 def _transfers(validation: DataSet) -> list[Transfer]:
-    """The first place of one validation object, to be found on another of its kind, turned and moved; at most `TRANSFERS`."""
+    """Up to `TRANSFERS` tasks: find the first place of a validation object on another of its kind, in a random pose."""
     transfers = []
     pairs = validation.pairs()
     for index, pair in enumerate(pairs[:: max(1, len(pairs) // TRANSFERS)][:TRANSFERS]):
@@ -168,17 +174,17 @@ def _at_size(T_object_place):
 def _digest(initial):
     if initial is None:
         return None
-    return hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(initial))).hexdigest()[:16]
+    return digest(*jax.tree.leaves(initial))[:16]
 
 
 def validate(params, config: TrainConfig, pairs: list[Batch]) -> dict:
-    """Mean loss parts, and IoU on uniform points, of `tdf_jax.training.batch.validation_pairs`."""
+    """Mean parts of the loss, and IoU on uniform points, of `tdf_jax.training.batch.validation_pairs`."""
     rows = [_evaluate(params, config.network, dataclasses.astuple(pair)) for pair in pairs]
     return summary({name: np.stack([row[name] for row in rows]) for name in rows[0]})
 
 
 def transfer_errors(params, config: TrainConfig, transfers: list[Transfer]) -> dict:
-    """Median errors, centimetres and degrees, of the first place found on complete clouds, and the share within 2 cm and 20 degrees."""
+    """Median errors of the first place on complete clouds, cm and degrees, and the share within 2 cm and 20 degrees."""
     model = Model(params["network"], config.network, ModelInfo("training", "training", config.points))
     found = transferred(model, transfers, config=TRANSFER, progress=False)
     distance, angle = place_errors(found, transfers)
@@ -188,7 +194,7 @@ def transfer_errors(params, config: TrainConfig, transfers: list[Transfer]) -> d
 
 
 def summary(parts: dict) -> dict:
-    """Loss parts of several objects -> their means, with the mean intersection over union in place of its two parts."""
+    """Means of the loss parts of several objects, with the mean intersection over union instead of its two parts."""
     parts = {name: np.asarray(value, dtype=float) for name, value in parts.items()}
     iou = parts.pop("intersection") / np.maximum(parts.pop("union"), 1)
     return {name: round(float(value.mean()), 5) for name, value in (parts | {"iou": iou}).items()}
@@ -199,8 +205,8 @@ def _step(params, state, samples, step, config, optimiser):
     gradient, parts = mean_gradient(params, config, *samples)
     updates, optimisation = optimiser.update(gradient, state["optimiser"], params)
     params = optax.apply_updates(params, updates)
-    # The weight of the latest falls as 1/step, so the average reaches back over a share of the run, not over a number
-    # of steps.
+    # The weight of the latest parameters falls as 1/step, so the average covers a share of the run and not a number of
+    # steps.
     rate = 1 / (1 + AVERAGED * step)
     average = optax.incremental_update(params, state["average"], rate)
     return params, {"optimiser": optimisation, "average": average}, parts
@@ -216,8 +222,8 @@ def _optimiser(config: TrainConfig) -> optax.GradientTransformation:
     schedule = optax.warmup_cosine_decay_schedule(0.0, 1.0, config.warmup, config.steps, 0.02)
 
     def matrices(params):
-        # A first layer of 3 channels and a read-out of 1 have nothing to orthogonalise: they go to Adam with the
-        # vectors.
+        # Adam optimises a first layer of 3 channels and a read-out of 1 with the vectors, because they have nothing to
+        # orthogonalise.
         muon = optax.contrib.MuonDimensionNumbers()
         return jax.tree.map(lambda leaf: muon if leaf.ndim == 2 and min(leaf.shape) >= 16 else None, params)
 
@@ -230,9 +236,9 @@ def _optimiser(config: TrainConfig) -> optax.GradientTransformation:
 
 def batch_of(config: TrainConfig, data: DataSet, step: int, gradual: bool = True) -> Batch:
     """The batch of one step: a function of the seed and the step."""
-    corruption = config.corruption * (np.interp(step / config.steps, CORRUPTING, (0, 1)) if gradual else 1)
+    corruption = config.corruption * (np.interp(step / config.steps, CORRUPTION_RISE, (0, 1)) if gradual else 1)
     rng = np.random.default_rng([config.seed, 1, step])
-    return draw(data, rng, config.batch // 2, config.points, config.queries, corruption, config.box, config.poses)
+    return draw(data, rng, config.batch // 2, config.points, config.queries, corruption, config.box, config.num_poses)
 
 
 def _start(config, data, optimiser, initial):
@@ -240,27 +246,27 @@ def _start(config, data, optimiser, initial):
     centres = samples.centres.reshape(8, 3) * config.network.scaling
     clouds = samples.clouds.reshape(8, config.points, 3)
 
-    @jax.jit  # whole: operation by operation there are hundreds of programs to compile
+    @jax.jit  # without it, every operation is a program to compile, and there are hundreds
     def latents(network):
         return jax.lax.map(lambda cloud: encode_latent(network, config.network, cloud), clouds)
 
     if initial is None:
         network = initialise(jax.random.key(config.seed), config.network)
-        # Mean pooling shrinks the latent; rms 0.5 lets the decoder see it from the first step.
+        # Mean pooling shrinks the latent. At an rms of 0.5 it influences the decoder from the first step.
         final = network["encoder"]["fc_c"]["map_to_feat"]
         final["kernel"] = final["kernel"] * (0.5 / jnp.sqrt(jnp.mean(latents(network) ** 2)))
         frame = jnp.zeros((config.network.latent, 3))
         if not (data.fold == 1).any():
             frame = frame.at[:, 1].set(_any_front(np.asarray(latents(network)), config.seed))
     else:
-        network = jax.tree.map(jnp.array, initial)  # a copy: the first step takes its arguments over
+        network = jax.tree.map(jnp.array, initial)  # a copy, because the first step donates its arguments
         frame = _read_outs(np.asarray(latents(network)), centres, samples.fold.reshape(8), config.seed)
     params = {"network": network, "frame": frame}
     return params, {"optimiser": optimiser.init(params), "average": jax.tree.map(jnp.copy, params)}
 
 
 def _read_outs(latents, centres, fold, seed):
-    """The frame's read-outs (latent, 3) that fit latents (objects, latent, 3) best; weights do not carry them."""
+    """Read-outs (latent, 3) of the frame that fit latents (objects, latent, 3) best; weight files do not have them."""
     truths = np.stack([np.stack([UP, FRONT, centre], axis=1) for centre in centres])
     known = fold >= 0, fold == 1, fold >= 0
     read = [_fitted(latents[these], truths[these][..., number]) for number, these in enumerate(known)]
@@ -270,14 +276,16 @@ def _read_outs(latents, centres, fold, seed):
 
 
 def _any_front(latents, seed):
-    """A read-out (latent,) of vectors about 1 long: from zeros, none of a symmetric object's fronts would ever be nearer than another."""
-    return np.random.default_rng([seed, 3]).normal(size=latents.shape[1]) / np.sqrt(
-        np.mean(np.sum(latents**2, axis=(1, 2)))
-    )
+    """A random read-out (latent,) of vectors of a length of about 1.
+
+    With a read-out of zeros, all fronts of a symmetric object would remain at the same distance.
+    """
+    scale = np.sqrt(np.mean(np.sum(latents**2, axis=(1, 2))))
+    return np.random.default_rng([seed, 3]).normal(size=latents.shape[1]) / scale
 
 
 def _fitted(latents, truths):
-    """The read-out (latent,) of least squares; zeros where there is nothing to fit it to."""
+    """The read-out (latent,) of least squares; zeros if there are no latents."""
     if not len(latents):
         return np.zeros(latents.shape[1])
     return np.linalg.lstsq(np.concatenate([latent.T for latent in latents]), truths.reshape(-1))[0]

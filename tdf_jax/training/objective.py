@@ -1,4 +1,4 @@
-"""What training minimises: occupancy, the frame the latent must carry, and descriptors that agree at an object's places."""
+"""The training loss: of occupancy, of the object's frame in the latent, and of descriptors at corresponding places."""
 
 import functools
 
@@ -14,9 +14,9 @@ from tdf_jax.training.batch import QUARTERS
 
 FRAME_WEIGHT = 0.3
 PLACE_WEIGHT = 0.1
-# Objects come in a canonical frame: up, and the front, the side of the handle or a longer one.
+# Objects are in their canonical frame: up, and the front, which is the side of the handle or a longer side.
 UP, FRONT = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
-# The places' loss is the negative log of the right pose's share, each pose weighing energy^-SHARPNESS.
+# The places' loss is the negative log of the right pose's share, with weights energy^-SHARPNESS.
 SHARPNESS = 8.0
 
 
@@ -31,20 +31,21 @@ def pair_loss(
     shown: Float[Array, "2 box 3"],
     offered: Float[Array, "2 offers box 3"],
 ) -> tuple[Float[Array, ""], dict]:
-    """Loss of a pair of objects: occupancy, `FRAME_WEIGHT` times the frame's error, `PLACE_WEIGHT` times the places'.
+    """Loss of a pair of objects: occupancy, `FRAME_WEIGHT` times the frame error, `PLACE_WEIGHT` times the place error.
 
     Args:
-        params: {"network": ..., "frame": (latent, 3)}.
+        params: parameters of the network and the read-outs of the frame, {"network": ..., "frame": (latent, 3)}.
         config: sizes of the network.
-        clouds: centred, canonical orientation, metres.
-        queries: relative to the cloud's mean, metres.
-        inside: 1 inside the object, 0 outside.
-        centres: origins of the objects' frames, relative to the cloud's mean.
-        fold: symmetry of the objects, see `tdf_jax.symmetry`.
-        shown, offered: query points at a place; see `tdf_jax.training.batch.Batch`.
+        clouds: point clouds, (2, points, 3), metres, canonical axes, relative to their means.
+        queries: query points, (2, queries, 3), metres, relative to the clouds' means.
+        inside: 1 inside the object, 0 outside, (2, queries).
+        centres: origins of the objects' frames, (2, 3), metres, relative to the clouds' means.
+        fold: symmetry of the objects, (2,), see `tdf_jax.geometry.symmetry`.
+        shown: query points at a place of each object, (2, box, 3); see `tdf_jax.training.batch.Batch`.
+        offered: the same query points on the other object, (2, offers, box, 3).
 
     Returns:
-        The loss, and its parts by name, one of each object.
+        The loss, and its parts by name, one value for each object.
     """
     fields, losses, parts = _each(
         functools.partial(_object_loss, params, config), clouds, queries, inside, centres, fold
@@ -55,12 +56,12 @@ def pair_loss(
 
 
 def _each(function, *samples):
-    """`function` of the samples of every object."""
+    """Map a function over the samples of the objects."""
     return jax.lax.map(lambda sample: function(*sample), samples) if one_at_a_time() else jax.vmap(function)(*samples)
 
 
 def _object_loss(params, config, cloud, queries, inside, centre, fold):
-    """The field, and binary cross-entropy plus the frame's error with the parts they are reported by."""
+    """The field of an object, its loss of occupancy and frame, and the parts to report."""
     latent = encode_latent(params["network"], config, cloud)
     conditioned = condition(params["network"], config, latent)
     _, logits = decode(conditioned, queries)
@@ -79,31 +80,30 @@ def _object_loss(params, config, cloud, queries, inside, centre, fold):
 def frame_error(
     params, latent: Float[Array, "latent 3"], centre: Float[Array, "3"], fold: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """Squared error of the object's frame read out of a latent: up, the front as far as there is one, and the frame's origin.
+    """Squared error of the object's frame that linear read-outs take from a latent: up, front and the frame's origin.
 
-    Three linear read-outs (`params["frame"]`, (latent, 3), used in training only) of a latent whose vectors turn with
-    the object: a vector-neuron network has no bias, so it must find the frame in the cloud, and being equivariant it
-    needs no rotated copies for it. Without this term, an early trial could not match an object with itself after 500
-    steps; with it, the frame is found within 200. A cloud seen from one side has its mean off the object's middle: the
-    origin tells by how much.
+    The three read-outs (`params["frame"]`, (latent, 3)) are used in training only. A vector-neuron network has no bias,
+    so it must find the frame in the cloud, and being equivariant it needs no rotated copies for it. Training without
+    this term does not find the frame in reasonable time. The mean of a cloud that is seen from one side is not at the
+    object's centre, and the origin represents the difference.
 
-    A symmetric object has several fronts that are as good: the nearest counts. Asked for none, the network laid all
-    vectors of a bowl's latent along its axis, and no shape but one of revolution could be told from them (IoU of oval
-    and square ones 0.3); asked for any, and shown clouds displaced (`NetworkConfig.asymmetry`), it tells their sides.
+    A symmetric object has several equivalent fronts, and the nearest one counts. Without a term for the front, the
+    network aligns all vectors of a symmetric object's latent with its axis and represents nothing but shapes of
+    revolution. With this term and displaced clouds (`NetworkConfig.symmetry_breaking_offset`), it distinguishes the
+    sides. docs/guide/training.md has the measurements.
 
     Args:
-        params: see `pair_loss`.
-        latent: of a cloud in its canonical orientation.
-        centre: origin of the object's frame relative to the cloud's mean, in the network's unit.
-        fold: symmetry of the object; a round one is asked for no front.
+        params: parameters, see `pair_loss`.
+        latent: latent of a cloud in its canonical axes, (latent, 3).
+        centre: origin of the object's frame, (3,), in the network's unit, relative to the cloud's mean.
+        fold: symmetry of the object; a round one has no front.
     """
     up, front, origin = params["frame"].T @ latent
     turns = jnp.arange(QUARTERS)
     fronts = jnp.round(jnp.stack([jnp.cos(turns * jnp.pi / 2), jnp.sin(turns * jnp.pi / 2), 0 * turns], axis=1))
-    misses = jnp.where(turns * fold % QUARTERS == 0, jnp.sum((front - fronts) ** 2, axis=1), jnp.inf)
-    return (
-        jnp.sum((up - jnp.asarray(UP)) ** 2) + jnp.where(fold > 0, jnp.min(misses), 0) + jnp.sum((origin - centre) ** 2)
-    )
+    front_errors = jnp.where(turns * fold % QUARTERS == 0, jnp.sum((front - fronts) ** 2, axis=1), jnp.inf)
+    front_error = jnp.where(fold > 0, jnp.min(front_errors), 0)
+    return jnp.sum((up - jnp.asarray(UP)) ** 2) + front_error + jnp.sum((origin - centre) ** 2)
 
 
 def place_error(
@@ -112,12 +112,12 @@ def place_error(
     shown: Float[Array, "box 3"],
     offered: Float[Array, "offers box 3"],
 ) -> Float[Array, ""]:
-    """How badly the descriptors shown at a place of one object choose the same place of another among wrong poses.
+    """Negative log probability of the right pose of another object's place, by the energies of candidate poses.
 
     With E_k the descriptor loss (eq. 2) of pose k, the right one first: -log(E_0^-s / sum_k E_k^-s), s = `SHARPNESS`.
-    It asks of the energy what imitation asks of it, that its minimum lie at the right pose, and does not depend on the
-    energy's unit. A symmetric object has several right poses, and its network takes one of its fronts for the front:
-    the best of them counts.
+    Imitation needs an energy with its minimum at the right pose, which is what this error rewards, and the error does
+    not depend on the unit of the energy. A symmetric object has several right poses, and its network takes one of its
+    fronts for the front; the right pose of the least energy counts.
     """
     reference = shown_on.descriptors(shown)
     energy = jnp.mean(jnp.abs(offered_to.descriptors(offered) - reference), axis=(1, 2))
@@ -126,11 +126,11 @@ def place_error(
 
 
 def mean_gradient(params, config: NetworkConfig, *samples):
-    """Gradients averaged over a batch of pairs of objects, and the loss and its parts of each.
+    """Gradients averaged over a batch of pairs of objects, and the loss of every pair and its parts.
 
-    On a CPU one pair after the other: a scan that adds up gradients holds one pair's activations at a time, and is
-    faster there than `vmap`. Products are of the device's default precision, rounded to 10 bits on some accelerators,
-    as the shipped weights of bowls, of bottles and of all three were trained.
+    A CPU takes one pair after the other: a scan that accumulates gradients holds the activations of one pair at a time,
+    and is faster there than `vmap`. Products have the default precision of the device, which is less than float32 on
+    some accelerators; the shipped weights of bowls, of bottles and of all three categories were trained so.
     """
     with jax.default_matmul_precision(jax.config.jax_default_matmul_precision or "default"):
         return _mean_gradient(params, config, samples)

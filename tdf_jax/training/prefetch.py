@@ -1,4 +1,4 @@
-"""Batches drawn ahead of the steps that take them: by a thread, or by processes where an accelerator would wait for one."""
+"""Prefetching of batches by a thread, or by processes if an accelerator would wait for one thread."""
 
 import concurrent.futures
 import concurrent.futures.process
@@ -18,73 +18,74 @@ from pathlib import Path
 
 import numpy as np
 
+from tdf_jax._internal import checks
 from tdf_jax._internal.devices import one_at_a_time
 from tdf_jax._internal.errors import InputError
 from tdf_jax.training.batch import Batch
 from tdf_jax.training.dataset import DataSet
 
-AHEAD = 2  # batches a process has been asked for at any time, so that none waits for this one
+PREFETCH = 2  # batches requested of each process at any time, so that no process waits for this one
 
-_draw = None  # of a drawing process
+_draw: Callable[[int], Batch] | None = None  # set in a drawing process
 
 
 @contextlib.contextmanager
-def drawn_ahead(
+def prefetched(
     draw: Callable[[DataSet, int], Batch], data: DataSet, start: int, workers: int
 ) -> Iterator[Iterator[Batch]]:
-    """The batches of the steps from `start` on, in order; a step's batch does not depend on who draws it.
+    """The batches of the steps from `start` on, in order; a step's batch does not depend on the worker.
 
     Args:
-        draw: from the data and a step to its batch; of several workers one that can be pickled.
-        data: the objects.
-        start: the first step.
-        workers: processes, which begin with the main module of this one; 1 is a thread of this one.
+        draw: makes the batch of the data and a step; it can be pickled if there are several workers.
+        data: objects to draw from.
+        start: first step.
+        workers: number of processes, which import the main module of this one; 1 is a thread of this process.
 
     Raises:
-        InputError: workers is less than 1, or, when the next batch is asked for, a process died.
+        InputError: `workers` is less than 1, or, when the next batch is requested, a process died.
     """
-    if workers < 1:
-        raise InputError(f"drawn_ahead(): workers is {workers}; expected at least 1")
+    checks.count("train()", "workers", workers)
     with contextlib.ExitStack() as stack:
         if workers == 1:
             pool = concurrent.futures.ThreadPoolExecutor(1)
             ask = functools.partial(pool.submit, draw, data)
         else:
-            # Mapped from files, all processes share one copy of the objects.
+            # All processes map the same files and share one copy of the objects.
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tdf_train_")))
             for field in dataclasses.fields(data):
                 np.save(folder / f"{field.name}.npy", getattr(data, field.name))
-            # Started afresh, for a forked copy of a process that runs JAX may hang.
+            # Processes are spawned because a forked copy of a process that runs JAX may hang.
             pool = concurrent.futures.ProcessPoolExecutor(
                 workers, multiprocessing.get_context("spawn"), _open, (folder, draw)
             )
             ask = functools.partial(pool.submit, _drawn)
         stack.callback(pool.shutdown, cancel_futures=True)
-        yield _in_order(ask, start, asked_ahead(workers))
+        yield _in_order(ask, start, num_prefetched(workers))
 
 
-def asked_ahead(workers: int) -> int:
-    """How many batches are drawn, or waited for, at any time."""
-    return 1 if workers == 1 else AHEAD * workers
+def num_prefetched(workers: int) -> int:
+    """Number of batches that are requested at any time."""
+    return 1 if workers == 1 else PREFETCH * workers
 
 
-def _in_order(ask, start, ahead):
-    asked = deque(ask(step) for step in range(start, start + ahead))
-    for step in itertools.count(start + ahead):
+def _in_order(ask, start, count):
+    requested = deque(ask(step) for step in range(start, start + count))
+    for step in itertools.count(start + count):
         try:
-            batch = asked.popleft().result()
+            batch = requested.popleft().result()
         except concurrent.futures.process.BrokenProcessPool:
             raise InputError(
-                "train(): a process that drew samples died, perhaps for want of memory; expected it to live: use fewer workers, and run again to go on"
+                "train(): a process that drew samples died, perhaps for lack of memory; expected it to live. Use fewer "
+                "workers, and run again to resume"
             ) from None
-        asked.append(ask(step))
+        requested.append(ask(step))
         yield batch
 
 
 def _open(folder, draw):
-    """Make this process one that draws."""
+    """Prepare this process to draw batches."""
     global _draw
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process of the terminal: the run answers it
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process of the terminal, and the run handles it
     threading.Thread(target=_end_with_the_run, args=(folder,), daemon=True).start()
     columns = {
         field.name: np.asarray(np.load(folder / f"{field.name}.npy", mmap_mode="r"))
@@ -94,16 +95,19 @@ def _open(folder, draw):
 
 
 def _end_with_the_run(folder):
-    """A killed run tells nobody: its processes would wait for ever for another step, and its objects would stay on the disk."""
-    multiprocessing.parent_process().join()
+    """End this process and remove the folder when the run ends, because a killed run can do neither."""
+    run = multiprocessing.parent_process()
+    assert run is not None
+    run.join()
     shutil.rmtree(folder, ignore_errors=True)
     os._exit(1)
 
 
 def _drawn(step):
+    assert _draw is not None
     return _draw(step)
 
 
 def usual_workers() -> int:
-    """A thread beside a CPU, which has no core to spare; beside an accelerator a process on every core."""
+    """Default number of workers: a thread on a CPU, which has no core to spare; with an accelerator one per core."""
     return 1 if one_at_a_time() else os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""The folder of a run: its settings, its metrics as JSON lines, its checkpoint. What a kill leaves can be gone on from."""
+"""The folder of a run: settings, metrics as JSON lines, and a checkpoint. An interrupted run resumes from it."""
 
 import json
 from pathlib import Path
@@ -9,12 +9,18 @@ from flax import serialization
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
+from tdf_jax.networks import occupancy
+from tdf_jax.training import config
 
 CONFIG, METRICS, STATE = "config.json", "metrics.jsonl", "state.msgpack"
 
 
 def claim(directory: Path, settings: dict) -> None:
-    """Write the run's settings, or compare them with what stands there: only `steps` may differ.
+    """Write the settings of a run, or compare them with those in the folder; only `steps` may differ.
+
+    Args:
+        directory: folder of the run; it is made if it does not exist.
+        settings: JSON values, as `dataclasses.asdict` gives of `TrainConfig`, and digests of the inputs.
 
     Raises:
         InputError: the folder holds a run with other settings, or cannot be written.
@@ -34,9 +40,18 @@ def claim(directory: Path, settings: dict) -> None:
 
 
 def settings_of(directory: Path) -> dict | None:
-    """Settings of the run that stands in a folder, if one does."""
+    """Settings of the run in a folder, under today's names; None if there is no run."""
     path = directory / CONFIG
-    return _read(path, lambda content: dict(json.loads(content))) if path.exists() else None
+    return _read(path, lambda content: _current(dict(json.loads(content)))) if path.exists() else None
+
+
+def _current(settings: dict) -> dict:
+    """Settings that the release before may have written, under today's names."""
+    settings = {config.FORMER_FIELDS.get(name, name): value for name, value in settings.items()}
+    network = settings.get("network")
+    if isinstance(network, dict):
+        settings["network"] = {occupancy.FORMER_FIELDS.get(name, name): value for name, value in network.items()}
+    return settings
 
 
 def save(directory: Path, params, state, step: int) -> None:
@@ -45,7 +60,7 @@ def save(directory: Path, params, state, step: int) -> None:
 
 
 def restore(directory: Path, params, state) -> tuple:
-    """Parameters, the optimiser's state and the step of the checkpoint; what was given, and 0, where there is none."""
+    """Parameters, optimiser state and step of the checkpoint; the arguments and 0 if there is no checkpoint."""
     path = directory / STATE
     if not path.exists():
         return params, state, 0
@@ -54,20 +69,21 @@ def restore(directory: Path, params, state) -> tuple:
     shapes = [[leaf.shape for leaf in jax.tree.leaves(tree)] for tree in (target["params"], saved["params"])]
     if shapes[0] != shapes[1]:
         raise InputError(
-            f"train(): {path} is a checkpoint of another network; expected one of these settings. Choose another directory."
+            f"train(): {path} is a checkpoint of another network; expected one of these settings. "
+            "Choose another directory."
         )
     return saved["params"], saved["state"], int(saved["step"])
 
 
 def metrics(directory: Path) -> list[dict]:
-    """The rows of a run's metrics; a line that a kill cut short is left out."""
+    """The rows of a run's metrics, without a line that an interruption cut short."""
     path = directory / METRICS
     rows = (_row(line) for line in path.read_text().splitlines()) if path.exists() else ()
     return [row for row in rows if row is not None]
 
 
 def drop_later_metrics(directory: Path, step: int) -> None:
-    """A run killed after its last checkpoint repeats some steps; their first lines go."""
+    """Remove the metrics of steps after a checkpoint, which a resumed run repeats."""
     rows = [row for row in metrics(directory) if row["step"] <= step]
     replace_file("train", directory / METRICS, "".join(json.dumps(row) + "\n" for row in rows).encode())
 
@@ -85,5 +101,6 @@ def _read(path, parse):
     except Exception as error:  # damaged files raise whatever their parser stumbles on
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(
-            f"train(): {path} cannot be read ({reason}): damaged, or of another version; delete the folder, or restore the file"
+            f"train(): cannot read {path} ({reason}): it is damaged or of another version. Delete the folder, or "
+            "restore the file"
         ) from None

@@ -1,4 +1,4 @@
-"""Contact sheets: many objects side by side, at one scale."""
+"""Contact sheet: many objects side by side, at one scale."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 
 def contact_sheet(objects: "Sequence[tuple[str, trimesh.Trimesh]]", columns: int = 8) -> Figure:
-    """Meshes in rows, all at one scale, seen from above and one side.
+    """Draw meshes in rows, all at one scale and seen obliquely from above.
 
     Args:
         objects: titles and meshes, metres.
-        columns: in a row.
+        columns: number of columns.
     """
     half = max(float(np.max(mesh.extents)) for _, mesh in objects) / 2
     lines = -(-len(objects) // columns)

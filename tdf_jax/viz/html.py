@@ -71,7 +71,7 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
                 i=i,
                 j=j,
                 k=k,
-                color=matplotlib.colors.to_hex(polygons3d.CLAY),
+                color=matplotlib.colors.to_hex(polygons3d.SURFACE_COLOUR),
                 name="object",
                 showlegend=True,
             )

@@ -1,19 +1,20 @@
-"""Solid things in matplotlib's 3-D axes, cut into small pieces.
+"""Opaque surfaces and boxes in matplotlib's 3-D axes, as small polygons of one collection.
 
-Matplotlib has no depth buffer: it paints a collection's polygons from far to near by their mean depth, and collections
-one after the other. A mug, boxes and lines hide each other rightly only as small pieces of one collection.
+Matplotlib has no depth buffer: it paints the polygons of a collection from far to near by their mean depth, and one
+collection after the other. A mug, boxes and lines therefore occlude each other correctly only as small polygons of one
+collection.
 """
 
 import dataclasses
 
-import matplotlib
 import numpy as np
 from jaxtyping import Float
+from matplotlib.colors import to_rgb
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-CLAY = np.array([0.93, 0.90, 0.86])
-SHADE = 0.5  # brightness of a face seen edge-on to the light
-WIDTH = 0.7  # of all edges, points
+SURFACE_COLOUR = np.array([0.93, 0.90, 0.86])
+SHADE = 0.5  # brightness of a face parallel to the light
+WIDTH = 0.7  # of all edges, typographic points
 CUTS = 8  # pieces along a box's edge
 CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
 EDGES = [(i, i + step) for step in (4, 2, 1) for i in range(8) if not i & step]  # along x, y and z
@@ -32,37 +33,37 @@ class Pieces:
         return Pieces(*(getattr(self, f.name) + getattr(other, f.name) for f in dataclasses.fields(self)))
 
     def collection(self) -> Poly3DCollection:
-        """What `axes.add_collection3d` takes."""
-        # One width for all: matplotlib reorders the colours with the polygons, but not the widths.
+        """The collection for `axes.add_collection3d`."""
+        # All have one width because matplotlib sorts the colours with the polygons, but not the widths.
         return Poly3DCollection(self.polygons, facecolors=self.faces, edgecolors=self.edges, linewidths=WIDTH)
 
 
 def surface(triangles: Float[np.ndarray, "faces 3 3"], light: Float[np.ndarray, "3"]) -> Pieces:
-    """An opaque surface, shaded by a distant light from both sides.
+    """An opaque surface, shaded on both sides by a distant light.
 
     Args:
-        triangles: corners.
-        light: unit vector towards the light.
+        triangles: corners of the triangles, (faces, 3, 3).
+        light: unit vector towards the light, (3,).
     """
     u, v = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     normals = np.cross(u, v)
     lengths = np.linalg.norm(normals, axis=1)
     kept = lengths > 0
     brightness = SHADE + (1 - SHADE) * np.abs(normals[kept] @ light / lengths[kept])
-    colours = [(*colour, 1.0) for colour in brightness[:, None] * CLAY]
-    return Pieces(list(triangles[kept]), colours, colours)  # edges of the face's colour close the seams between faces
+    colours = [(*colour, 1.0) for colour in brightness[:, None] * SURFACE_COLOUR]
+    return Pieces(list(triangles[kept]), colours, colours)  # edges in the colour of the face close the seams
 
 
 def box(corners: Float[np.ndarray, "8 3"], colour, *, filled: bool = True, dashed: bool = False) -> Pieces:
-    """A box as its edges and, faintly filled, its face towards +x.
+    """The edges of a box and its face towards +x, transparent.
 
     Args:
-        corners: in the order of `CORNERS`.
-        colour: of both.
-        filled: draw the face.
-        dashed: leave out every other piece of an edge.
+        corners: corners of the box in the order of `CORNERS`, (8, 3).
+        colour: colour of edges and face.
+        filled: whether to draw the face.
+        dashed: whether to omit every other piece of an edge.
     """
-    colour = matplotlib.colors.to_rgb(colour)
+    colour = to_rgb(colour)
     cuts = np.linspace(0, 1, CUTS + 1)[:, None]
     lines = []
     for i, j in EDGES:

@@ -1,4 +1,4 @@
-"""Curves of a training run, in matplotlib and without its global state."""
+"""Curves of a training run, in matplotlib without its global state."""
 
 from collections.abc import Sequence
 
@@ -12,18 +12,18 @@ from tdf_jax.viz.style import INK, STYLE, TRUTH
 PANELS = (
     ("bce", "occupancy: binary cross-entropy", "log"),
     ("iou", "occupancy: IoU at 0.5; transfer: success", "linear"),
-    ("frame", "frame read out of the latent: squared error", "log"),
-    ("place", "places: -log share of the right pose", "linear"),
+    ("frame", "frame from the latent: squared error", "log"),
+    ("place", "places: -log probability of the right pose", "linear"),
 )
-SMOOTH = 50  # steps averaged in the curves of training
+SMOOTH = 50  # steps over which the training curves are averaged
 SETS = (("validation", "validation, complete clouds", TRUTH), ("one_view", "validation, one view", INK))
 
 
 def training_figure(rows: Sequence[dict]) -> Figure:
-    """Losses and IoU against the step, of training batches and of both validations.
+    """Losses and IoU over the steps, of training batches and of both validations.
 
     Args:
-        rows: lines of metrics, as `tdf_jax.training.run_folder.metrics` reads them.
+        rows: metrics of the steps, from `tdf_jax.training.run_folder.metrics`.
     """
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(7.2, 4.6), layout="constrained")
@@ -39,7 +39,7 @@ def training_figure(rows: Sequence[dict]) -> Figure:
             panel.set(title=label, yscale=scale)
             if scale == "log":
                 panel.yaxis.set_major_formatter("{x:g}")
-                # Within less than a decade the powers of ten alone would leave an axis without a number.
+                # An axis of less than a decade would have no number with powers of ten only.
                 panel.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1, 0.5)))
             panel.grid(color="#dddddd", lw=0.5)
         shares = [(row["step"], row["transfer"]["success"]) for row in rows if "transfer" in row]

@@ -138,7 +138,7 @@ def test_the_path_of_the_page_is_printed(folder, weights, capsys):
 
 def test_run_again_it_computes_nothing_and_writes_the_same(folder, weights, monkeypatch, tmp_path):
     shutil.copytree(folder, again := tmp_path / "again")
-    monkeypatch.setattr("tdf_jax.evaluation.methods.Attempts.of", lambda *_: pytest.fail("computed again"))
+    monkeypatch.setattr("tdf_jax.evaluation.path_methods.Attempts.of", lambda *_: pytest.fail("computed again"))
     for name in ("benchmark.md", "benchmark.json", "truth.png"):
         (again / name).unlink()
     run("--weights", weights, *PLAIN, "--out", again)
@@ -173,7 +173,7 @@ def real(tmp_path_factory):
 def everything(folder, weights, real, tmp_path_factory):
     """More of the same: other clouds, real meshes and several demonstrations."""
     shutil.copytree(folder, out := tmp_path_factory.mktemp("everything") / "out")
-    words = ("--clouds", "full", "noise", "full", "--meshes", real, "--poses", 2, "--demonstrations", 1, 3)
+    words = ("--clouds", "full", "noise", "full", "--meshes", real, "--num-poses", 2, "--demonstrations", 1, 3)
     run("--weights", weights, *PLAIN, "oracle correspondences", *words, "--out", out)
     return out
 
@@ -196,7 +196,7 @@ def test_clouds_meshes_and_demonstrations_add_to_what_there_was(folder, everythi
     ]
     assert shared == before["tasks"]
     assert (everything / "demonstrations.png").read_bytes().startswith(PNG) and "demonstrations.png" in told(everything)
-    assert record["settings"]["meshes"] == str(real) and f"--meshes {real} --poses 2 --demonstrations 1 3" in told(
+    assert record["settings"]["meshes"] == str(real) and f"--meshes {real} --num-poses 2 --demonstrations 1 3" in told(
         everything
     )
 
@@ -235,7 +235,7 @@ def test_real_meshes_alone_with_the_paths_in_turn(weights, real, tmp_path):
         0,
         "--meshes",
         two,
-        "--poses",
+        "--num-poses",
         2,
         "--methods",
         "copy",
@@ -257,12 +257,12 @@ def test_all_methods_is_every_method(weights, tmp_path, monkeypatch):
         asked.append(list(names))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("tdf_jax.evaluation.path_runs.run", watched)
+    monkeypatch.setattr("tdf_jax.evaluation.path_scores.run", watched)
     for words in ((), ("--methods", "copy", "all")):
         with pytest.raises(SystemExit) as stop:
             run("--weights", weights, *words, "--out", tmp_path / "out")
         assert stop.value.code == 130
-    from tdf_jax.evaluation.methods import METHODS
+    from tdf_jax.evaluation.path_methods import METHODS
 
     assert asked == [list(METHODS)] * 2
 
@@ -298,8 +298,8 @@ def test_pictures_show_every_path_and_goals_where_there_are_enough_tasks(weights
         (("--height", 0), "--height is 0.0; expected metres between 0.01 and 1"),
         (("--height", 12), "--height is 12.0"),
         (("--height", "nan"), "--height is nan"),
-        (("--inits", 0), "--inits is 0; expected at least 1"),
-        (("--poses", 0), "--poses is 0; expected at least 1"),
+        (("--num-starts", 0), "--num-starts is 0; expected at least 1"),
+        (("--num-poses", 0), "--num-poses is 0; expected at least 1"),
         (("--methods", "RANSAC"), "--methods has 'RANSAC'; expected all, or some of 'copy', 'centroids',"),
         (("--methods", "copy", "ndf"), "--methods has 'ndf'; expected all"),
         (("--methods",), "--methods has none; expected all"),
@@ -308,13 +308,13 @@ def test_pictures_show_every_path_and_goals_where_there_are_enough_tasks(weights
         (("--demonstrations", 3, -1), "--demonstrations is (3, -1); expected numbers of 1 to 100"),
         (("--demonstrations", 0), "--demonstrations is (0,)"),
         (("--demonstrations", 101), "--demonstrations is (101,)"),
-        (("--weights", "teapot"), "no weights are called 'teapot'"),
+        (("--weights", "teapot"), "there are no weights 'teapot'"),
         (("--meshes", "missing"), "there is no folder missing"),
     ],
 )
 def test_mistakes_are_told_before_anything_is_written(words, message, weights, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("tdf_jax.evaluation.path_runs.run", lambda *_, **__: pytest.fail("the work has begun"))
+    monkeypatch.setattr("tdf_jax.evaluation.path_scores.run", lambda *_, **__: pytest.fail("the work has begun"))
     if words[0] == "--meshes":
         pytest.importorskip("igl")
     with pytest.raises(SystemExit) as stop:
@@ -328,7 +328,7 @@ def test_mistakes_are_told_before_anything_is_written(words, message, weights, t
 @pytest.mark.parametrize("place", ["file", "file/out"])
 def test_a_folder_that_cannot_be_made_is_told_before_the_work(place, weights, tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("mine")
-    monkeypatch.setattr("tdf_jax.evaluation.path_runs.run", lambda *_, **__: pytest.fail("the work has begun"))
+    monkeypatch.setattr("tdf_jax.evaluation.path_scores.run", lambda *_, **__: pytest.fail("the work has begun"))
     with pytest.raises(SystemExit) as stop:
         run("--weights", weights, "--out", tmp_path / place)
     assert (
@@ -348,7 +348,7 @@ def test_a_method_that_can_try_nothing_is_told(weights, real, tmp_path, capsys):
             0,
             "--meshes",
             real,
-            "--poses",
+            "--num-poses",
             1,
             "--methods",
             "oracle correspondences",
@@ -482,7 +482,7 @@ def test_reliability_is_drawn_from_bins_with_counts_of_right_and_wrong():
     np.testing.assert_allclose(points.lines[0].get_ydata(), [row["right"] for row in rows])
     ends = np.array([segment[:, 1] for segment in points.lines[2][0].get_segments()])
     np.testing.assert_allclose(ends, [row["interval"] for row in rows])
-    diagonal = steps(rates)["as often as said"]
+    diagonal = steps(rates)["ideal"]
     np.testing.assert_array_equal(diagonal[:, 0], diagonal[:, 1])
     drawn = {bars[0].get_label(): [bar.get_height() for bar in bars] for bars in counts.containers}
     for label, truth in (("right", 1), ("wrong", 0)):

@@ -15,15 +15,15 @@ import tdf_jax as tdf
 from tdf_jax.cli import imitate as report, main as command_line, options as scene
 from tdf_jax.cli.main import main
 from tdf_jax.cli.options import Settings
+from tdf_jax.evaluation.cases import PLACE
 from tdf_jax.evaluation.metrics import pose_error
-from tdf_jax.evaluation.scene import PLACE
 from tdf_jax.geometry.paths import PATHS
 from tdf_jax.io.demonstrations import save_demonstration
 from tdf_jax.networks.checkpoint import load_model, save_model
 from tdf_jax.shapes import build_mug
 
-QUICK = ("--method", "adam", "--inits", 2, "--iterations", 3, "--points", 60)
-TINY = (*QUICK, "--poses", 4, "--queries", 8)
+QUICK = ("--method", "adam", "--num-starts", 2, "--iterations", 3, "--points", 60)
+TINY = (*QUICK, "--num-poses", 4, "--queries", 8)
 FILES = {"result.json", "trajectory.npz", "trajectory.tum", "imitation.png", "loss.png"}
 
 
@@ -91,11 +91,9 @@ def record_of(folder):
 
 
 def test_the_default_method_carries(imitate, watched, capsys):
-    record = imitate("--points", 60, "--poses", 4, "--queries", 8, "--inits", 6)
+    record = imitate("--points", 60, "--num-poses", 4, "--queries", 8, "--num-starts", 6)
     assert record["settings"]["method"] == "carry" and record["energy"] is None
-    assert record["optimiser"] == dataclasses.asdict(tdf.CarryConfig(scouts=6)) | {
-        "steps": list(tdf.CarryConfig().steps)
-    }
+    assert record["optimiser"] == dataclasses.asdict(tdf.CarryConfig(num_starts=6))
     np.testing.assert_array_equal(np.float32(record["energies"]), watched[0].energies)
     assert record["confidence"] is None  # not calibrated for these weights
     modes = tdf.cluster_poses(watched[0].trajectories[:, 0], watched[0].energies)
@@ -109,8 +107,10 @@ def test_the_default_method_carries(imitate, watched, capsys):
 
 
 def test_the_papers_energy_can_be_solved(imitate, watched, capsys):
-    record = imitate("--points", 60, "--poses", 4, "--queries", 8, "--inits", 2, "--method", "gauss-newton", "--k", 0.1)
-    assert tuple(record["optimiser"]["steps"]) == tdf.SolveConfig().steps and record["optimiser"]["inits"] == 2
+    record = imitate(
+        "--points", 60, "--num-poses", 4, "--queries", 8, "--num-starts", 2, "--method", "gauss-newton", "--k", 0.1
+    )
+    assert record["optimiser"] == dataclasses.asdict(tdf.SolveConfig(num_trajectory_starts=2))
     assert record["energy"] == dataclasses.asdict(tdf.EnergyWeights(0.1)) and record["modes"] is None
     np.testing.assert_array_equal(np.float32(record["energies"]), watched[0].energies)
     out = capsys.readouterr().out
@@ -133,7 +133,7 @@ def test_the_record_tells_all_settings(folder, weights):
         "seed": 0, "weights": str(weights), "out": str(folder), "no_plots": False, "json": False,
     }  # fmt: skip
     assert record["energy"] == dataclasses.asdict(tdf.EnergyWeights(0.02))
-    assert record["optimiser"] == dataclasses.asdict(tdf.OptimizeConfig(inits=2, iterations=3))
+    assert record["optimiser"] == dataclasses.asdict(tdf.OptimizeConfig(num_starts=2, iterations=3))
     assert record["weights"]["name"] == "small"
     assert record["status"] == "all 2 starts finite"
     seconds = record["seconds"]
@@ -194,7 +194,7 @@ def test_a_seed_gives_the_same_run_and_another_another(imitate, folder):
 def test_no_start_is_drawn_from_the_key_of_the_targets_pose(imitate, watched):
     """With one key for both, a start's rotation would be the answer before any step."""
     expected = np.array(imitate(*TINY)["expected"])
-    _, radians = pose_error(watched[0].starts[:, 0], expected[0])
+    _, radians = pose_error(watched[0].initial_trajectories[:, 0], expected[0])
     assert (radians > 0.2).all()
 
 
@@ -293,7 +293,7 @@ def test_generated_demonstrations_go_from_the_handle_to_the_place(shape):
     assert np.ptp(made.points[:, 2]) == pytest.approx(0.12, abs=0.002)
 
 
-@pytest.mark.parametrize(("poses", "words"), [(4, ()), (6, ("--poses", 4))])
+@pytest.mark.parametrize(("poses", "words"), [(4, ()), (6, ("--num-poses", 4))])
 def test_an_own_demonstration(imitate, tmp_path, poses, words):
     points = np.random.default_rng(0).normal(size=(70, 3)).astype(np.float32)
     demonstration = tdf.Demonstration(points, tdf.line(num_poses=poses), tdf.box_query(jax.random.key(0), 8))
@@ -370,8 +370,8 @@ def test_bad_target_files(refusal, weights, tmp_path, name):
     (("--method", "adam", "--k", "-0.1"), "--k is -0.1; expected a weight of 0 or more"),
     (("--method", "gauss-newton", "--k", "nan"), "--k is nan"),
     (("--k", "0.02"), "--k is a weight of eq. 3, which --method carry does not minimise"),
-    (("--poses", "1"), "poses is 1; expected a whole number of at least 2"),
-    (("--inits", "0"), "--inits is 0"),
+    (("--num-poses", "1"), "poses is 1; expected a whole number of at least 2"),
+    (("--num-starts", "0"), "--inits is 0"),
     (("--method", "adam", "--iterations", "0"), "iterations is 0"),
     (("--iterations", "50"), "--iterations is for --method adam"),
     (("--queries", "0"), "count is 0"),
@@ -398,7 +398,7 @@ def test_a_target_scale_of_zero(refusal, weights, tmp_path):
     (("imitate", "--trajectory", "circle"), "'semicircle'"),
     (("imitate", "--target-pose", "upright"), "'given'"),
     (("imitate", "--weight", "mug"), "--weights"),
-    (("imitate", "--inits", "few"), "INT"),
+    (("imitate", "--num-starts", "few"), "INT"),
     (("imitate", "extra"), "extra"),
     (("imitation",), "imitate"),
     ((), "imitate"),
@@ -409,7 +409,7 @@ def test_unknown_words_name_what_exists(refusal, words, exists):
 
 
 def test_unknown_weights_name_what_exists(refusal):
-    check(refusal("imitate", "--weights", "teapot"), r"no weights are called 'teapot'; expected a name that exists \(")
+    check(refusal("imitate", "--weights", "teapot"), r"there are no weights 'teapot'; expected one of \(")
 
 
 def tampered(weights, change):
@@ -428,8 +428,8 @@ def other_sizes(weights):
 BAD_WEIGHTS = {
     "truncated": (lambda weights: weights.read_bytes()[:-10], "truncated"),
     "tampered": (lambda weights: tampered(weights, lambda c: c.__setitem__(-1, c[-1] ^ 1)), "checksum"),
-    "foreign": (lambda weights: b"not weights", "not a whole safetensors file"),
-    "empty": (lambda weights: b"", "not a whole safetensors file"),
+    "foreign": (lambda weights: b"not weights", "not a valid safetensors file"),
+    "empty": (lambda weights: b"", "not a valid safetensors file"),
     "another architecture": (other_sizes, r"expected \("),
 }
 
@@ -499,20 +499,22 @@ def test_train_refuses_bad_numbers_before_training(refusal, tmp_path, monkeypatc
         "^tdf: error: tdf train: --workers is -1; expected 1 or more, or 0",
     )
     check(
-        refusal("train", "--out", tmp_path / "run", "--network.asymmetry", 1),
-        "network.asymmetry is 1.0; expected 0 to less than 1",
+        refusal("train", "--out", tmp_path / "run", "--network.symmetry-breaking-offset", 1),
+        "symmetry_breaking_offset is 1.0; expected 0 to less than 1",
     )
 
 
 @pytest.mark.parametrize(
     ("given", "asked", "trained"), [(0.0, None, 0.0), (0.2, None, 0.2), (0.0, 0.1, 0.1), (0.2, 0.1, 0.1)]
 )
-def test_a_run_keeps_the_asymmetry_of_the_weights_it_goes_on_from_unless_another_is_asked_for(
+def test_a_run_keeps_the_offset_of_its_start_weights_unless_another_is_given(
     given, asked, trained, weights, tmp_path, monkeypatch, capsys
 ):
     model = load_model(weights)
     start = tmp_path / "start.safetensors"
-    save_model(dataclasses.replace(model, config=dataclasses.replace(model.config, asymmetry=given)), start)
+    save_model(
+        dataclasses.replace(model, config=dataclasses.replace(model.config, symmetry_breaking_offset=given)), start
+    )
     runs = []
 
     def trained_as(config, *_, initial, workers):
@@ -529,9 +531,9 @@ def test_a_run_keeps_the_asymmetry_of_the_weights_it_goes_on_from_unless_another
         for name in ("latent", "vector_hidden", "vector_width", "decoder_width", "blocks")
     }
     options = [word for name, size in sizes.items() for word in (f"--network.{name.replace('_', '-')}", size)]
-    options += [] if asked is None else ["--network.asymmetry", asked]
+    options += [] if asked is None else ["--network.symmetry-breaking-offset", asked]
     run("train", "--out", tmp_path / "run", "--data", tmp_path, "--start-from", start, *options, "--workers", 3)
-    expected = dataclasses.replace(model.config, asymmetry=trained)
+    expected = dataclasses.replace(model.config, symmetry_breaking_offset=trained)
     assert runs == [(expected, 3)]
     assert load_model(tmp_path / "run" / "weights.safetensors").config == expected
 
@@ -548,14 +550,14 @@ def real(tmp_path_factory):
     return folder
 
 
-EVALUATE = ("--pairs", 2, "--inits", 2, "--iterations", 2, "--seed", 3)
+EVALUATE = ("--pairs", 2, "--num-starts", 2, "--iterations", 2, "--seed", 3)
 
 
 @pytest.fixture(scope="module")
 def evaluation(weights, real, tmp_path_factory):
     """The record of a run with all options but pictures, and its model card."""
     folder = tmp_path_factory.mktemp("evaluation")
-    words = ("--meshes", real, "--poses", 2, "--clouds", "full", "views1", "half", "--baselines")
+    words = ("--meshes", real, "--num-poses", 2, "--clouds", "full", "views1", "half", "--baselines")
     run(
         "evaluate",
         "--weights",
@@ -620,7 +622,7 @@ def test_a_model_card_tells_what_the_record_does(evaluation):
     assert lines[0] == "# small" and "| trained by | a test |" in lines
     assert "Generated mugs: 2 that no training run saw, 2 transfers of the handle." in lines
     assert (
-        "`tdf evaluate --seed 3 --pairs 2 --inits 2 --iterations 2 --meshes DIR --poses 2 --category mug --clouds full views1 half`"
+        "`tdf evaluate --seed 3 --pairs 2 --num-starts 2 --iterations 2 --meshes DIR --num-poses 2 --category mug --clouds full views1 half`"
         in card
     )
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.count("|") == 11]
@@ -636,10 +638,21 @@ def test_a_model_card_tells_what_the_record_does(evaluation):
 def test_pictures_of_an_evaluation(weights, real, tmp_path, monkeypatch):
     drawn, triangle = [], np.array([[[0, 0, 0], [0.05, 0, 0], [0, 0.05, 0.01]]])
     monkeypatch.setattr(
-        "tdf_jax.networks.surface.reconstructed", lambda field, T, bounds: drawn.append(bounds) or triangle
+        "tdf_jax.networks.surface.surface_triangles", lambda field, T, bounds: drawn.append(bounds) or triangle
     )
     monkeypatch.setattr("tdf_jax.cli.evaluate.MOST_GENERATED", 1)
-    run("evaluate", "--weights", weights, *EVALUATE, "--meshes", real, "--poses", 2, "--figures", tmp_path / "pictures")
+    run(
+        "evaluate",
+        "--weights",
+        weights,
+        *EVALUATE,
+        "--meshes",
+        real,
+        "--num-poses",
+        2,
+        "--figures",
+        tmp_path / "pictures",
+    )
     assert {path.name for path in (tmp_path / "pictures").iterdir()} == {"reconstructions.png", "transfers.png"}
     assert (tmp_path / "pictures" / "transfers.png").read_bytes().startswith(b"\x89PNG")
     assert len(drawn) == 2  # one generated mug, and the real one in one of its poses
@@ -656,11 +669,11 @@ def test_every_condition_can_be_asked_for():
 @pytest.mark.parametrize(("words", "message"), [
     (("--pairs", "0"), "--pairs is 0; expected at least 1, or 0 with --meshes"),
     (("--pairs", "-1", "--meshes", "."), "--pairs is -1"),
-    (("--poses", "0"), "--poses is 0"),
+    (("--num-poses", "0"), "--num-poses is 0"),
     (("--seed", "-1"), "--seed is -1"),
     (("--size", "12"), "--size is 12.0; expected metres"),
     (("--place", "spout"), "--place is 'spout'; expected one of a mug's: handle, rim, base"),
-    (("--inits", "0"), "inits is 0"),
+    (("--num-starts", "0"), "inits is 0"),
     (("--clouds", "fog"), "views1"),
     (("--meshes", "none"), "load_annotated.*there is no folder none"),
     (("--meshes", "."), "load_annotated.*is empty"),

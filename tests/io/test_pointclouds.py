@@ -12,7 +12,7 @@ import trimesh
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
-from tdf_jax.geometry.sampling import thin, thin_indices
+from tdf_jax.geometry.sampling import thin, farthest_point_indices
 from tdf_jax.io.meshes import load_mesh
 from tdf_jax.io.pointclouds import load_points
 
@@ -267,17 +267,17 @@ def test_check_points_inside_jit_checks_the_shape():
 def test_thinning_by_hand():
     """On a line the mean is 3.4, so 10 is first, then 0; then 4 (4 away) before 3 (3) and 0.0."""
     points = np.array([[0, 0, 0], [3, 0, 0], [4, 0, 0], [10, 0, 0], [0, 0, 0]], np.float32)
-    np.testing.assert_array_equal(thin_indices(points, 3), [3, 0, 2])
+    np.testing.assert_array_equal(farthest_point_indices(points, 3), [3, 0, 2])
     np.testing.assert_array_equal(thin(points, 3), points[[3, 0, 2]])
-    np.testing.assert_array_equal(thin_indices(points, 4), [3, 0, 2, 1])
+    np.testing.assert_array_equal(farthest_point_indices(points, 4), [3, 0, 2, 1])
     assert thin(points, 5) is points
     assert thin(points, 9) is points
-    np.testing.assert_array_equal(thin_indices(points, 9), range(5))
+    np.testing.assert_array_equal(farthest_point_indices(points, 9), range(5))
 
 
 def test_thinning_takes_the_farthest_point_each_time():
     points = np.random.default_rng(1).normal(size=(200, 3))
-    indices = thin_indices(points, 30)
+    indices = farthest_point_indices(points, 30)
     assert indices[0] == np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1))
     distances = np.linalg.norm(points[:, None] - points[None], axis=-1)
     for i in range(1, 30):
@@ -286,12 +286,12 @@ def test_thinning_takes_the_farthest_point_each_time():
 
 def test_thinning_never_takes_a_point_twice():
     points = np.repeat(np.eye(3), 10, axis=0)
-    assert len(set(thin_indices(points, 25))) == 25
+    assert len(set(farthest_point_indices(points, 25))) == 25
 
 
 def test_thinning_far_from_the_origin_is_the_same():
     points = CLOUD.astype(np.float64)
-    np.testing.assert_array_equal(thin_indices(points, 20), thin_indices(points + 1e4, 20))
+    np.testing.assert_array_equal(farthest_point_indices(points, 20), farthest_point_indices(points + 1e4, 20))
 
 
 def test_thinning_refuses_bad_input():

@@ -13,11 +13,18 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from tdf_jax._internal.errors import InputError
 from tdf_jax.networks import checkpoint
 from tdf_jax.networks.checkpoint import available_models, load_model, save_model
-from tdf_jax.networks.model import Model, ModelInfo
+from tdf_jax.networks.model import Model, ModelInfo, fingerprint
 from tdf_jax.networks.occupancy import NetworkConfig, parameter_shapes
 
 CONFIG = NetworkConfig(
-    latent=2, vector_hidden=3, vector_width=6, decoder_width=4, blocks=1, neighbours=3, scaling=7.5, asymmetry=0.1
+    latent=2,
+    vector_hidden=3,
+    vector_width=6,
+    decoder_width=4,
+    blocks=1,
+    neighbours=3,
+    scaling=7.5,
+    symmetry_breaking_offset=0.1,
 )
 
 
@@ -69,10 +76,30 @@ def test_a_model_survives_the_file(saved):
         np.testing.assert_array_equal(before, after)
 
 
-def test_a_file_from_before_there_was_asymmetry_has_none(saved):
-    before = {name: value for name, value in dataclasses.asdict(CONFIG).items() if name != "asymmetry"}
-    rewrite(saved, header={"config": before}, checksum=True)
-    assert load_model(saved).config == dataclasses.replace(CONFIG, asymmetry=0.0)
+def test_a_file_from_before_there_was_an_offset_has_none(saved):
+    before = {name: value for name, value in dataclasses.asdict(CONFIG).items() if name != "symmetry_breaking_offset"}
+    rewrite(saved, header={"schema": 1, "config": before}, checksum=True)
+    assert load_model(saved).config == dataclasses.replace(CONFIG, symmetry_breaking_offset=0.0)
+
+
+def test_a_file_of_the_release_before_has_its_offset_under_the_former_name(saved):
+    former = {
+        "asymmetry" if name == "symmetry_breaking_offset" else name: value for name, value in vars(CONFIG).items()
+    }
+    rewrite(saved, header={"schema": 1, "config": former}, checksum=True)
+    model = load_model(saved)
+    assert model.config == CONFIG
+    save_model(model, saved)
+    with safetensors.safe_open(saved, framework="numpy") as file:
+        header = json.loads(file.metadata()["tdf_jax"])
+    assert header["schema"] == 2 and header["config"] == dataclasses.asdict(CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("name", "start"), [("mug", "ad4cf37f70e26018"), ("bowl", "eba207d7d2f47251"), ("multi", "8071e18edf10a401")]
+)
+def test_fingerprints_of_shipped_weights_stay_because_they_name_results_on_disk(name, start):
+    assert fingerprint(load_model(name)).startswith(start)
 
 
 def test_unknown_cloud_points_and_whole_number_scaling_survive(tmp_path):
@@ -129,7 +156,7 @@ def test_shipped_weights_are_found_by_name(tmp_path, monkeypatch, folder):
     assert available_models() == ("bowl", "mug")
     assert load_model("bowl").info.name == "bowl"
     assert "'mugs'" in refusal("mugs") and "(bowl, mug)" in refusal("mugs")
-    assert "no weights are called ''" in refusal("")
+    assert "there are no weights ''" in refusal("")
     assert "there is no file" in refusal("./mug") and "(bowl, mug)" in refusal("./mug")
 
 
@@ -154,7 +181,7 @@ def test_missing_file_and_directory(tmp_path):
 )
 def test_truncated_and_trailing_bytes(saved, change):
     saved.write_bytes(change(saved.read_bytes()))
-    assert "not a whole safetensors file" in refusal(saved)
+    assert "not a valid safetensors file" in refusal(saved)
 
 
 def test_every_flipped_bit_is_noticed(saved):
@@ -188,7 +215,7 @@ def test_other_safetensors_files(tmp_path):
     headers = [{"tdf_jax": text} for text in ("{", "[]", '{"schema": 1}', "[" * 100_000)]
     for metadata in (None, {"format": "pt"}, *headers):
         path.write_bytes(safetensors.numpy.save({"x": np.zeros(3)}, metadata))
-        assert "not a file that tdf_jax wrote" in refusal(path)
+        assert "no metadata of tdf_jax" in refusal(path)
 
 
 def test_pytorch_file_points_to_the_converter(tmp_path):
@@ -197,8 +224,8 @@ def test_pytorch_file_points_to_the_converter(tmp_path):
 
 
 def test_newer_schema(saved):
-    rewrite(saved, header={"schema": 2}, checksum=True)
-    assert "schema is 2" in refusal(saved)
+    rewrite(saved, header={"schema": 3}, checksum=True)
+    assert "schema is 3; expected 1 or 2" in refusal(saved)
 
 
 def test_missing_extra_and_misshapen_tensors_are_all_named(saved):
@@ -235,9 +262,9 @@ def test_non_finite_weights_are_named(saved, bad):
 @pytest.mark.parametrize(
     ("field", "value", "reason"),
     [
-        ("config", {"latent": "many"}, "NetworkConfig.latent is a str"),
-        ("config", {"latent": True}, "NetworkConfig.latent is a bool"),
-        ("config", {"latent": 0}, "cannot be those of"),
+        ("config", {"latent": "many"}, "its NetworkConfig(): latent is 'many'; expected a whole number"),
+        ("config", {"latent": True}, "latent is True; expected a whole number"),
+        ("config", {"latent": 0}, "latent is 0; expected a whole number of at least 1"),
         ("config", {"blocks": 10**9}, "cannot be those of"),
         ("config", {"depth": 3}, "expected fields"),
         ("config", {}, "not those of its network"),

@@ -11,12 +11,13 @@ from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
-from tdf_jax.geometry.sampling import thinnings
-from tdf_jax.networks.encoding import agreeing
+from tdf_jax.geometry.sampling import subsamples
+from tdf_jax.networks.encoding import consistent_latents
 from tdf_jax.networks.occupancy import encode_latent
 
 # float32 coordinates half a metre away carry 3e-8 m, of offsets of 5 cm; the network's own rounding is 1e-5.
 EQUIVARIANCE = {"float32": 2e-4, "float64": 1e-10}
+latent_of = jax.jit(encode_latent, static_argnums=1)  # its parts one by one are programs of their own
 
 
 def near(points, count=16, seed=5):
@@ -121,22 +122,22 @@ def test_gradients_reach_the_points_of_the_least_cloud_where_some_coincide(small
 
 
 @pytest.fixture(scope="module")
-def thinning_model(small_model):
+def subsampling_model(small_model):
     """A network that knows clouds of 24 points."""
     return dataclasses.replace(small_model, info=dataclasses.replace(small_model.info, cloud_points=24))
 
 
-def test_a_dense_cloud_is_thinned_several_times_and_the_latents_averaged(small_model, thinning_model):
+def test_a_dense_cloud_is_subsampled_several_times_and_the_latents_averaged(small_model, subsampling_model):
     points = random_cloud(0, 90).astype(np.float32)
-    clouds = thinnings(points, 24, 4)
+    clouds = subsamples(points, 24, 4)
     assert clouds.shape == (4, 24, 3)
     np.testing.assert_array_equal(clouds[0], tdf.thin(points, 24))
     fields = [tdf.encode(small_model, cloud) for cloud in clouds]
     latents = np.stack([field.latent for field in fields])
     assert np.abs(latents - latents[0]).max() > 1e-2 * np.abs(latents).max()
-    agreed = np.asarray(agreeing(jnp.asarray(latents), np.ones(4, bool)))
+    agreed = np.asarray(consistent_latents(jnp.asarray(latents), np.ones(4, bool)))
     assert agreed.any()
-    found = tdf.encode(thinning_model, points, thinnings=4)
+    found = tdf.encode(subsampling_model, points, num_subsamples=4)
     np.testing.assert_allclose(found.latent, latents[agreed].mean(axis=0), atol=1e-6)
     np.testing.assert_allclose(
         found.origin, np.mean([field.origin for field in fields], axis=0, where=agreed[:, None]), atol=1e-7
@@ -144,55 +145,53 @@ def test_a_dense_cloud_is_thinned_several_times_and_the_latents_averaged(small_m
 
 
 @pytest.fixture(scope="module")
-def displacing_model(thinning_model):
+def displacing_model(subsampling_model):
     """It sees clouds of 24 points, displaced."""
-    return dataclasses.replace(thinning_model, config=dataclasses.replace(thinning_model.config, asymmetry=0.2))
+    return dataclasses.replace(
+        subsampling_model, config=dataclasses.replace(subsampling_model.config, symmetry_breaking_offset=0.2)
+    )
 
 
 def test_a_displaced_cloud_is_seen_away_from_its_farthest_point(small_model, displacing_model):
-    """All thinnings alike, by the farthest point of the whole cloud; where the field is, is not displaced."""
+    """All subsamples alike, by the farthest point of the whole cloud; where the field is, is not displaced."""
     points = random_cloud(0, 90).astype(np.float32)
-    tip = points[np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1))]
-    clouds = thinnings(points, 24, 4)
+    anchor = points[np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1))]
+    clouds = subsamples(points, 24, 4)
     latents = []
     for cloud in clouds:
         centred = cloud - cloud.mean(axis=0)
         latents.append(
-            np.asarray(
-                encode_latent(small_model.params, small_model.config, centred - 0.2 * (tip - cloud.mean(axis=0)))
-            )
+            np.asarray(latent_of(small_model.params, small_model.config, centred - 0.2 * (anchor - cloud.mean(axis=0))))
         )
     plain = np.stack([tdf.encode(small_model, cloud).latent for cloud in clouds])
     assert np.abs(np.stack(latents) - plain).max() > 1e-2 * np.abs(plain).max()
-    agreed = np.asarray(agreeing(jnp.asarray(latents), np.ones(4, bool)))
-    found = tdf.encode(displacing_model, points, thinnings=4)
+    agreed = np.asarray(consistent_latents(jnp.asarray(latents), np.ones(4, bool)))
+    found = tdf.encode(displacing_model, points, num_subsamples=4)
     np.testing.assert_allclose(found.latent, np.mean(latents, axis=0, where=agreed[:, None, None]), atol=1e-5)
     np.testing.assert_allclose(found.origin, clouds[agreed].mean(axis=(0, 1)), atol=1e-6)
     # Of a sparse cloud, filled up with points that do not count, the same as of the points alone, under jax.jit too.
     few = points[:22]
     centred = few - few.mean(axis=0)
-    alone = encode_latent(small_model.params, displacing_model.config, centred)
+    alone = latent_of(small_model.params, displacing_model.config, centred)
     farthest = centred[np.argmax(np.linalg.norm(centred, axis=1))]
     np.testing.assert_allclose(
-        alone, encode_latent(small_model.params, small_model.config, centred - 0.2 * farthest), atol=1e-5
+        alone, latent_of(small_model.params, small_model.config, centred - 0.2 * farthest), atol=1e-5
     )
     filled, used = np.concatenate([centred, 9 + centred[:5]]), np.arange(27) < 22
-    np.testing.assert_allclose(
-        encode_latent(small_model.params, displacing_model.config, filled, used), alone, atol=1e-5
-    )
+    np.testing.assert_allclose(latent_of(small_model.params, displacing_model.config, filled, used), alone, atol=1e-5)
     for field in (tdf.encode(displacing_model, few), jax.jit(lambda points: tdf.encode(displacing_model, points))(few)):
         np.testing.assert_allclose(field.latent, alone, atol=1e-5)
         np.testing.assert_allclose(field.origin, few.mean(axis=0), atol=1e-7)
 
 
-def test_a_symmetric_object_has_sides_to_a_network_with_asymmetry_only(small_model, displacing_model):
+def test_a_symmetric_object_has_sides_to_a_network_with_an_offset_only(small_model, displacing_model):
     """A cloud that half a turn leaves as it is: without, all of its latent lies along the axis."""
     half = random_cloud(1, 12) - random_cloud(1, 12).mean(axis=0)
     points = np.concatenate([half, half * (-1, -1, 1)])
     points -= points.mean(axis=0)
     shares = []
     for config in (small_model.config, displacing_model.config):
-        latent = np.asarray(encode_latent(small_model.params, config, points.astype(np.float32)))
+        latent = np.asarray(latent_of(small_model.params, config, points.astype(np.float32)))
         shares.append(np.sum(latent[:, :2] ** 2) / np.sum(latent**2))
     assert shares[0] < 1e-8
     assert shares[1] > 1e-2
@@ -217,19 +216,19 @@ def noisy(latent, turns, seed):
 ])  # fmt: skip
 def test_only_latents_that_show_one_of_the_poses_of_a_symmetric_object_are_averaged(turns, kept):
     latents = noisy(random_cloud(0, 40), np.array(turns, float), seed=1)
-    np.testing.assert_array_equal(agreeing(latents, np.ones(len(turns), bool)), [one == "1" for one in kept])
+    np.testing.assert_array_equal(consistent_latents(latents, np.ones(len(turns), bool)), [one == "1" for one in kept])
     # What only fills up the room never counts, be it alike.
     filled, used = jnp.concatenate([latents, latents[1:2], latents[1:2]]), np.arange(len(turns) + 2) < len(turns)
-    np.testing.assert_array_equal(agreeing(filled, used), [one == "1" for one in kept + "00"])
+    np.testing.assert_array_equal(consistent_latents(filled, used), [one == "1" for one in kept + "00"])
 
 
 def test_latents_that_are_only_noisy_agree():
     """Noise as large as the latent: no rotation brings two of them much nearer."""
     latents = random_cloud(0, 40) + np.random.default_rng(2).normal(size=(8, 40, 3)) * np.std(random_cloud(0, 40))
-    assert np.asarray(agreeing(jnp.asarray(latents, jnp.float32), np.ones(8, bool))).all()
+    assert np.asarray(consistent_latents(jnp.asarray(latents, jnp.float32), np.ones(8, bool))).all()
 
 
-@pytest.mark.parametrize("model", ["thinning_model", "displacing_model"])
+@pytest.mark.parametrize("model", ["subsampling_model", "displacing_model"])
 def test_the_average_turns_with_the_cloud(model, request):
     model, points = request.getfixturevalue(model), random_cloud(0, 90)
     R = Rotation.random(random_state=0).as_matrix()
@@ -238,17 +237,17 @@ def test_the_average_turns_with_the_cloud(model, request):
     np.testing.assert_allclose(moved.origin, R @ still.origin + 0.3, atol=1e-6)
 
 
-def test_points_are_used_as_they_are_where_there_is_nothing_to_thin(small_model, thinning_model):
+def test_points_are_used_as_they_are_where_there_is_nothing_to_subsample(small_model, subsampling_model):
     dense, sparse = random_cloud(0, 90), random_cloud(0, 24)
     plain = tdf.encode(small_model, dense).latent  # a density that is not known
-    np.testing.assert_array_equal(tdf.encode(thinning_model, dense, thinnings=0).latent, plain)
+    np.testing.assert_array_equal(tdf.encode(subsampling_model, dense, num_subsamples=0).latent, plain)
     np.testing.assert_allclose(
-        tdf.encode(thinning_model, sparse).latent, tdf.encode(small_model, sparse).latent, atol=1e-6
+        tdf.encode(subsampling_model, sparse).latent, tdf.encode(small_model, sparse).latent, atol=1e-6
     )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["small_model", "thinning_model"])
+@pytest.mark.parametrize("model", ["small_model", "subsampling_model"])
 def test_clouds_of_many_sizes_run_one_program_and_what_fills_them_up_does_not_count(model, request, small_model):
     model = request.getfixturevalue(model)
     sizes = (21, 23, 24)
@@ -258,19 +257,19 @@ def test_clouds_of_many_sizes_run_one_program_and_what_fills_them_up_does_not_co
         fields = [tdf.encode(model, cloud) for cloud in clouds]
     assert names == []
     for cloud, field in zip(clouds, fields):
-        plain = encode_latent(small_model.params, small_model.config, cloud - cloud.mean(axis=0))
+        plain = latent_of(small_model.params, small_model.config, cloud - cloud.mean(axis=0))
         np.testing.assert_allclose(field.latent, plain, atol=2e-6 * np.abs(plain).max())
         np.testing.assert_allclose(field.origin, cloud.mean(axis=0), atol=1e-7)
         traced = jax.jit(lambda points: tdf.encode(model, points))(cloud)
         np.testing.assert_allclose(traced.latent, field.latent, atol=2e-6 * np.abs(plain).max())
 
 
-@pytest.mark.parametrize("model", [pytest.param("small_model", marks=pytest.mark.slow), "thinning_model"])
+@pytest.mark.parametrize("model", [pytest.param("small_model", marks=pytest.mark.slow), "subsampling_model"])
 def test_the_latent_has_a_gradient_with_respect_to_the_parameters(model, request):
     model, cloud = request.getfixturevalue(model), random_cloud(0, 90).astype(np.float32)
 
     def size(model):
-        return jnp.sum(tdf.encode(model, cloud, thinnings=3).latent ** 2)
+        return jnp.sum(tdf.encode(model, cloud, num_subsamples=3).latent ** 2)
 
     kernel = model.params["encoder"]["fc_c"]["map_to_feat"]["kernel"]
     slope = jax.grad(size)(model).params["encoder"]["fc_c"]["map_to_feat"]["kernel"]
@@ -284,17 +283,17 @@ def test_more_neighbours_than_points_are_refused(small_model):
         tdf.encode(model, random_cloud(0, 25))
 
 
-def test_a_cloud_hardly_denser_is_thinned_once():
+def test_a_cloud_hardly_denser_gives_one_subsample():
     points = random_cloud(0, 60)
-    assert len(thinnings(points, 24, 8)) == 1
-    assert len(thinnings(points, 20, 8)) == 8
+    assert len(subsamples(points, 24, 8)) == 1
+    assert len(subsamples(points, 20, 8)) == 8
 
 
-def test_thinning_is_refused_where_it_cannot_be_done(thinning_model):
-    with pytest.raises(InputError, match="90 points cannot be thinned to 24 under jax.jit"):
-        jax.jit(lambda points: tdf.encode(thinning_model, points).latent)(random_cloud(0, 90))
-    with pytest.raises(InputError, match="thinnings is -1"):
-        tdf.encode(thinning_model, random_cloud(0, 90), thinnings=-1)
+def test_subsampling_is_refused_where_it_cannot_be_done(subsampling_model):
+    with pytest.raises(InputError, match="90 points cannot be subsampled to 24 under jax.jit"):
+        jax.jit(lambda points: tdf.encode(subsampling_model, points).latent)(random_cloud(0, 90))
+    with pytest.raises(InputError, match="num_subsamples is -1"):
+        tdf.encode(subsampling_model, random_cloud(0, 90), num_subsamples=-1)
 
 
 def spoiled(value):

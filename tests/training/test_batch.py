@@ -23,7 +23,7 @@ def objects(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    monkeypatch.setattr(batch, "DENSE", 1000)
+    monkeypatch.setattr(batch, "DENSE_POINTS", 1000)
     monkeypatch.setattr(batch, "SPARSE_CLOUDS", (250, 1000))
 
 
@@ -169,7 +169,7 @@ def drawn_indices(data, monkeypatch, pairs, seed=0):
         return sensed(data, rng, index, corruption, points)
 
     monkeypatch.setattr(batch, "_sensed", noted)
-    made = drawn(data, seed, pairs=pairs, points=6, queries=2, box=2, poses=2)
+    made = drawn(data, seed, pairs=pairs, points=6, queries=2, box=2, num_poses=2)
     return np.reshape(asked, (pairs, 2)), made
 
 
@@ -250,10 +250,10 @@ def test_wrong_poses_are_wrong_for_every_turn_a_symmetry_allows(objects, diagona
     monkeypatch.setattr(batch, "_wrong", turned)
     bases = dataclasses.replace(many(objects, [fold] * 3, [0] * 3), places=objects.places[:, [0, 2, 2]])
     found = []
-    for sample, partner in pairs_of(drawn(bases, 1, pairs=12, poses=5)):
+    for sample, partner in pairs_of(drawn(bases, 1, pairs=12, num_poses=5)):
         right, wrong = sample["offered"][0].astype(float), sample["offered"][batch.QUARTERS :].astype(float)
         found += [least_distance(one, right, partner["centres"], fold) for one in wrong]
-    assert np.min(found) > batch.LEAST_WRONG * diagonal - 1e-4
+    assert np.min(found) > batch.MIN_WRONG * diagonal - 1e-4
     assert set(offered_turns) == {0, 90, 135, 180, 225}
     assert len(offered_turns) > len(found)  # some were thrown away
 
@@ -265,10 +265,10 @@ def test_wrong_poses_as_training_draws_them_are_wrong_for_every_turn(objects, di
     data = many(objects, [fold] * 3, [0] * 3)
     found = [
         least_distance(wrong.astype(float), sample["offered"][0].astype(float), partner["centres"], fold)
-        for sample, partner in pairs_of(drawn(data, 2, pairs=12, poses=12))
+        for sample, partner in pairs_of(drawn(data, 2, pairs=12, num_poses=12))
         for wrong in sample["offered"][batch.QUARTERS :]
     ]
-    assert np.min(found) > batch.LEAST_WRONG * diagonal - 1e-5
+    assert np.min(found) > batch.MIN_WRONG * diagonal - 1e-5
     assert np.mean(np.array(found) < 0.1 * diagonal) > 0.05  # not only far ones
 
 
@@ -283,7 +283,7 @@ def test_of_objects_without_symmetry_turned_poses_and_close_ones_are_wrong(objec
         return wrong
 
     monkeypatch.setattr(batch, "_wrong", turned)
-    made = drawn(many(objects, [1] * 3, [0] * 3), 1, pairs=2, poses=5)
+    made = drawn(many(objects, [1] * 3, [0] * 3), 1, pairs=2, num_poses=5)
     assert len(asked) == 2 * 2 * 4  # none was drawn again
     assert (made.fold == 1).all()
 

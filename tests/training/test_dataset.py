@@ -416,7 +416,7 @@ def test_empty_folders_bad_meshes_and_mixed_units_are_refused_before_any_work(me
             quiet_build(scanned_recipe(folder), tmp_path / "data")
     trimesh.creation.box(extents=(1, 1, 1e-4)).export(meshes / "sheet.obj")
     (meshes / "torn.stl").write_bytes(b"solid")
-    with pytest.raises(InputError, match=r"2 of 6 meshes will not do; mend them or take them out:\n.*(\n.*)"):
+    with pytest.raises(InputError, match=r"2 of 6 meshes are not valid; repair or remove them:\n.*(\n.*)"):
         quiet_build(scanned_recipe(meshes), tmp_path / "data")
     for name in ("sheet.obj", "torn.stl"):
         (meshes / name).unlink()

@@ -16,9 +16,9 @@ from tdf_jax.training import dataset, prefetch
 from tdf_jax.training.config import TrainConfig
 from tdf_jax.training.dataset import Recipe, joined
 from tdf_jax.training.loop import batch_of
-from tdf_jax.training.prefetch import drawn_ahead
+from tdf_jax.training.prefetch import prefetched
 
-CONFIG = TrainConfig(seed=3, steps=40, batch=2, points=32, queries=16, box=4, poses=2)
+CONFIG = TrainConfig(seed=3, steps=40, batch=2, points=32, queries=16, box=4, num_poses=2)
 
 
 @pytest.fixture(scope="module")
@@ -50,8 +50,8 @@ def failing(data, step):
 @pytest.mark.parametrize("workers", [1, 2])
 def test_batches_come_in_the_order_of_steps_and_do_not_depend_on_who_draws_them(data, workers):
     batch = functools.partial(batch_of, CONFIG, gradual=False)
-    with drawn_ahead(batch, data, 5, workers) as batches:
-        for step in range(5, 5 + 2 * prefetch.AHEAD * workers + 1):
+    with prefetched(batch, data, 5, workers) as batches:
+        for step in range(5, 5 + 2 * prefetch.PREFETCH * workers + 1):
             for found, expected in zip(
                 dataclasses.astuple(next(batches)), dataclasses.astuple(batch(data, step)), strict=True
             ):
@@ -61,7 +61,7 @@ def test_batches_come_in_the_order_of_steps_and_do_not_depend_on_who_draws_them(
 
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_what_fails_while_drawing_is_raised_at_its_step(data, workers):
-    with drawn_ahead(failing, data, 0, workers) as batches:
+    with prefetched(failing, data, 0, workers) as batches:
         assert [next(batches), next(batches)] == [0, 1]
         with pytest.raises(ValueError, match="no batch"):
             next(batches)
@@ -69,7 +69,7 @@ def test_what_fails_while_drawing_is_raised_at_its_step(data, workers):
 
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_one_worker_is_a_thread_and_several_are_processes(data, workers):
-    with drawn_ahead(who, data, 0, workers) as batches:
+    with prefetched(who, data, 0, workers) as batches:
         drew = {next(batches) for _ in range(20)}
     assert drew == {os.getpid()} if workers == 1 else os.getpid() not in drew and len(drew) <= 2
 
@@ -77,7 +77,7 @@ def test_one_worker_is_a_thread_and_several_are_processes(data, workers):
 @pytest.mark.slow
 def test_what_processes_draw_from_is_not_left_behind(data, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    with drawn_ahead(who, data, 0, 2) as batches:
+    with prefetched(who, data, 0, 2) as batches:
         next(batches)
         assert len(list(tmp_path.glob("*/*.npy"))) == len(dataclasses.fields(data))
     assert not list(tmp_path.iterdir())
@@ -86,12 +86,12 @@ def test_what_processes_draw_from_is_not_left_behind(data, tmp_path, monkeypatch
 RUN = """
 import sys, time
 from tdf_jax.training import dataset
-from tdf_jax.training.prefetch import drawn_ahead
+from tdf_jax.training.prefetch import prefetched
 sys.path.append(sys.argv[1])
 from test_prefetch import who
 
 if __name__ == "__main__":
-    with drawn_ahead(who, dataset.load(sys.argv[2])[0], 0, 2) as batches:
+    with prefetched(who, dataset.load(sys.argv[2])[0], 0, 2) as batches:
         print(next(batches), next(batches), flush=True)
         time.sleep(600)
 """
@@ -112,12 +112,15 @@ def test_a_killed_run_leaves_neither_processes_nor_files(data, folder, tmp_path)
 
 @pytest.mark.slow
 def test_a_process_that_dies_is_told(data):
-    with drawn_ahead(dying, data, 0, 2) as batches, pytest.raises(InputError, match="a process that drew samples died"):
+    with prefetched(dying, data, 0, 2) as batches, pytest.raises(InputError, match="a process that drew samples died"):
         next(batches)
 
 
 def test_no_workers_are_refused(data):
-    with pytest.raises(InputError, match="workers is 0; expected at least 1"), drawn_ahead(who, data, 0, 0):
+    with (
+        pytest.raises(InputError, match="workers is 0; expected a whole number of at least 1"),
+        prefetched(who, data, 0, 0),
+    ):
         pass
 
 

@@ -11,7 +11,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from tdf_jax.networks import surface
-from tdf_jax.networks.surface import reconstructed
+from tdf_jax.networks.surface import surface_triangles
 from tdf_jax.viz import reconstruction
 from tdf_jax.viz.reconstruction import Panel, reconstruction_figure, transfer_figure
 
@@ -43,12 +43,12 @@ def test_the_surface_lies_where_the_occupancy_is_one_half(quick_compilation, coa
     pytest.importorskip("igl")
     T_world_object = np.eye(4)
     T_world_object[:3, :3], T_world_object[:3, 3] = R, [0.3, 0.2, -0.1]
-    triangles = reconstructed(Ellipsoid(jnp.array([0.3, 0.2, -0.1])), T_world_object, BOUNDS)
+    triangles = surface_triangles(Ellipsoid(jnp.array([0.3, 0.2, -0.1])), T_world_object, BOUNDS)
     size = np.linalg.norm(triangles / [0.05, 0.03, 0.02], axis=-1)
     np.testing.assert_allclose(size, 1, atol=0.02)  # in the object's frame, within a fifth of a cell
     mesh = trimesh.Trimesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
     assert mesh.is_watertight and abs(mesh.volume) == pytest.approx(4 / 3 * np.pi * 3e-5, rel=0.03)
-    away = reconstructed(Ellipsoid(jnp.array([2.0, 0.0, 0.0])), T_world_object, BOUNDS)
+    away = surface_triangles(Ellipsoid(jnp.array([2.0, 0.0, 0.0])), T_world_object, BOUNDS)
     assert away.shape == (0, 3, 3)
 
 
@@ -60,7 +60,7 @@ def panels():
     far = T.copy()
     far[:3, 3] = 5.0
     first = Panel("one", "IoU 0.80", "0.5 cm, 3° off", block, block * 0.9, T, T, 0.06)
-    return [first] * 5 + [dataclasses.replace(first, name="six", found=block[:0], T_object_found=far)]
+    return [first] * 5 + [dataclasses.replace(first, name="six", reconstructed=block[:0], T_object_estimate=far)]
 
 
 def panels_of(figure):

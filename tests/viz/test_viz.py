@@ -87,7 +87,7 @@ def test_a_surface_is_lit_from_one_side_and_skips_faces_without_area():
     pieces = polygons3d.surface(np.array([up, upright, flat], float), np.ones(3) / np.sqrt(3))
     assert len(pieces.polygons) == 2
     bright, dim = (np.array(colour[:3]) for colour in pieces.faces)
-    np.testing.assert_allclose(bright, polygons3d.CLAY)
+    np.testing.assert_allclose(bright, polygons3d.SURFACE_COLOUR)
     assert (dim < bright).all()
 
 
