@@ -1,4 +1,4 @@
-"""A demonstration: one trajectory shown on one object."""
+"""A demonstration: one trajectory demonstrated on one object."""
 
 import dataclasses
 
@@ -11,15 +11,16 @@ from tdf_jax.geometry.trajectory import Trajectory, check_trajectory
 
 @dataclasses.dataclass(frozen=True)
 class Demonstration:
-    """One trajectory shown on one object.
+    """One trajectory demonstrated on one object.
 
     Attributes:
-        points: the object's cloud, (points, 3), metres, world frame.
-        trajectory: poses of the query frame from the pick (index 0) to the place (last).
-        query: query points in the query frame, (queries, 3), metres.
+        points: object point cloud, (points, 3), metres, world frame.
+        trajectory: poses of the query frame, T_world_query, from the pick (index 0) to the place (the last index).
+        query: query points, (queries, 3), metres, query frame.
 
     Raises:
-        InputError: bad points, or query points that are not (queries, 3) and finite.
+        InputError: the points are not a point cloud, the trajectory fails `check_trajectory`, or the query points are
+            not (queries, 3) and finite.
     """
 
     points: Float[Array, "points 3"]
@@ -30,7 +31,8 @@ class Demonstration:
         checks.points("Demonstration()", self.points)
         if not isinstance(self.trajectory, Trajectory):
             raise InputError(
-                f"Demonstration(): trajectory is a {type(self.trajectory).__name__}; expected a Trajectory, such as tdf.wave()"
+                f"Demonstration(): trajectory is a {type(self.trajectory).__name__}; "
+                "expected a Trajectory, such as tdf.wave()"
             )
         check_trajectory(self.trajectory)
         checks.query("Demonstration()", self.query)

@@ -1,36 +1,37 @@
 """Rotations and rigid poses: exponentials, logarithms, distances, geodesics.
 
 Rotations are matrices `R` (..., 3, 3), rotation vectors (axis times angle, radians) or unit quaternions `wxyz`.
-Poses are `wxyz_xyz` (..., 7), quaternion then translation in metres: the layout of `jaxlie.SE3`. Quaternions are
-normalised on use, so any non-zero multiple of one is the same rotation, and they come out with w >= 0.
+Poses are `wxyz_xyz` (..., 7), quaternion then translation in metres: the layout of `jaxlie.SE3`. Functions normalise
+quaternions, so any non-zero multiple of a quaternion is the same rotation; returned quaternions have w >= 0.
 
-Every function is differentiable with finite gradients everywhere, the identity and half turns included, and compiled:
-op by op, the first trajectory of a process would compile every operation on its own.
+Every function is differentiable with finite gradients everywhere, the identity and half turns included. Every function
+is compiled as a whole, because op by op the first trajectory of a process would compile each operation separately.
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
+from numpy.typing import ArrayLike
 
-from tdf_jax._internal.errors import InputError
+from tdf_jax._internal import checks
 
-# Below these squares a power series replaces the quotient 0/0. They are generous on purpose, so that second
-# derivatives are accurate too; the terms left out are below 1e-16.
+# Below these squares a power series replaces the quotient 0/0. They are large on purpose, so that second derivatives
+# are accurate too; the omitted terms are below 1e-16.
 _SMALL_ANGLE_SQUARED = 0.03
 _SMALL_SINE_SQUARED = 1e-3
-SUPER_FIBONACCI = 1.533751168755204288118041  # the real root of psi^4 = psi + 4, of Alexa's table the best
+SUPER_FIBONACCI = 1.533751168755204288118041  # the positive root of psi^4 = psi + 4, the best in Alexa's table
 
 
 @jax.jit
 def exp(rotation_vector: Float[Array, "... 3"]) -> Float[Array, "... 3 3"]:
-    """Rotation matrix of a rotation vector.
+    """Compute the rotation matrix of a rotation vector.
 
     Args:
-        rotation_vector: Axis times angle, radians, of any length.
+        rotation_vector: axis times angle, (..., 3), radians, of any length.
 
     Returns:
-        Rotation matrices.
+        Rotation matrices, (..., 3, 3).
     """
     angle_squared = jnp.sum(rotation_vector * rotation_vector, axis=-1, keepdims=True)
     small = angle_squared < _SMALL_ANGLE_SQUARED
@@ -46,13 +47,13 @@ def exp(rotation_vector: Float[Array, "... 3"]) -> Float[Array, "... 3 3"]:
 
 @jax.jit
 def log(R: Float[Array, "... 3 3"]) -> Float[Array, "... 3"]:
-    """Rotation vector of a rotation matrix, the shortest one.
+    """Compute the shortest rotation vector of a rotation matrix.
 
     Args:
-        R: Rotation matrices.
+        R: rotation matrices, (..., 3, 3).
 
     Returns:
-        Axis times angle, radians, with the angle in [0, pi]. At a half turn it is one of the two that exist.
+        Axis times angle, (..., 3), radians, with the angle in [0, pi]. At a half turn it is one of the two solutions.
     """
     wxyz = wxyz_from_matrix(R)
     w, xyz = wxyz[..., :1], wxyz[..., 1:]
@@ -66,13 +67,13 @@ def log(R: Float[Array, "... 3 3"]) -> Float[Array, "... 3"]:
 
 @jax.jit
 def matrix_from_wxyz(wxyz: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
-    """Rotation matrix of a quaternion.
+    """Compute the rotation matrix of a quaternion.
 
     Args:
-        wxyz: Quaternions, not zero; their length does not matter.
+        wxyz: quaternions, (..., 4), not zero, of any length.
 
     Returns:
-        Rotation matrices.
+        Rotation matrices, (..., 3, 3).
     """
     w, x, y, z = (wxyz[..., i] for i in range(4))
     scale = 2 / (w * w + x * x + y * y + z * z)
@@ -86,16 +87,16 @@ def matrix_from_wxyz(wxyz: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
 
 @jax.jit
 def wxyz_from_matrix(R: Float[Array, "... 3 3"]) -> Float[Array, "... 4"]:
-    """Unit quaternion of a rotation matrix, with w >= 0.
+    """Compute the unit quaternion of a rotation matrix, with w >= 0.
 
-    The entries of 4 q q^T are linear in R. Its row with the largest diagonal entry is a multiple of q no shorter
-    than 2, so normalising that row is accurate for every rotation and needs no square root near zero.
+    The entries of 4 q q^T are linear in R. The row with the largest diagonal entry is a multiple of q whose length is at
+    least 2, so normalising that row is accurate for every rotation and needs no square root near zero.
 
     Args:
-        R: Rotation matrices.
+        R: rotation matrices, (..., 3, 3).
 
     Returns:
-        Unit quaternions.
+        Unit quaternions wxyz, (..., 4).
     """
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = (R[..., i, j] for i in range(3) for j in range(3))
     rows = [
@@ -110,38 +111,41 @@ def wxyz_from_matrix(R: Float[Array, "... 3 3"]) -> Float[Array, "... 4"]:
 
 
 def uniform_rotations(key: PRNGKeyArray, count: int) -> Float[Array, "count 3 3"]:
-    """Rotations drawn uniformly (Haar measure) from SO(3).
+    """Sample rotations uniformly (Haar measure) from SO(3).
 
     Args:
-        key: Random key.
-        count: How many, at least 1.
+        key: random key.
+        count: number of rotations, at least 1.
 
     Returns:
-        Rotation matrices.
-
-    Raises:
-        InputError: If count is below 1.
-    """
-    if count < 1:
-        raise InputError(f"uniform_rotations(): count is {count}; expected at least 1.")
-    return matrix_from_wxyz(jax.random.normal(key, (count, 4)))
-
-
-def rotation_grid(count: int) -> Float[np.ndarray, "count 3 3"]:
-    """Rotations spread evenly over SO(3): no draw, the same every time.
-
-    A spiral on the quaternions' sphere with irrational turns (super-Fibonacci: Alexa, "Super-Fibonacci Spirals: Fast,
-    Low-Discrepancy Sampling of SO(3)", CVPR 2022). Of 20,000 random rotations the one farthest from the grid was 60
-    degrees away with a count of 64, 29 with 512 and 13 with 4096; on average they were 30, 15 and 8 away.
-
-    Args:
-        count: how many, at least 1.
+        Rotation matrices, (count, 3, 3).
 
     Raises:
         InputError: count is below 1.
     """
-    if not isinstance(count, int | np.integer) or count < 1:
-        raise InputError(f"rotation_grid(): count is {count}; expected a whole number of at least 1")
+    checks.count("uniform_rotations()", "count", count)
+    return matrix_from_wxyz(jax.random.normal(key, (count, 4)))
+
+
+def rotation_grid(count: int) -> Float[np.ndarray, "count 3 3"]:
+    """Spread rotations evenly over SO(3); the grid is the same in every call.
+
+    The grid is a super-Fibonacci spiral on the sphere of unit quaternions. docs/results/code_notes.md lists its
+    covering radius.
+
+    Args:
+        count: number of rotations, at least 1.
+
+    Returns:
+        Rotation matrices, (count, 3, 3).
+
+    Raises:
+        InputError: count is below 1.
+
+    References:
+        Alexa, "Super-Fibonacci Spirals: Fast, Low-Discrepancy Sampling of SO(3)", CVPR 2022.
+    """
+    checks.count("rotation_grid()", "count", count)
     s = np.arange(count) + 0.5
     inner, outer = np.sqrt(s / count), np.sqrt(1 - s / count)
     alpha, beta = 2 * np.pi * s / np.sqrt(2), 2 * np.pi * s / SUPER_FIBONACCI
@@ -149,39 +153,37 @@ def rotation_grid(count: int) -> Float[np.ndarray, "count 3 3"]:
     return np.asarray(matrix_from_wxyz(wxyz))
 
 
-def turns(
-    axis: Float[Array, "3"], count: int, start: Float[Array, "3 3"] | None = None
-) -> Float[np.ndarray, "count 3 3"]:
-    """A slice of SO(3): an orientation turned about one axis in even steps, once around.
+def turns(axis: ArrayLike, count: int, start: Float[Array, "3 3"] | None = None) -> Float[np.ndarray, "count 3 3"]:
+    """Rotate an orientation about one axis in even steps, once around: a slice of SO(3).
 
     Args:
-        axis: in the world, of any length but zero.
-        count: how many, at least 1; the first is `start`.
-        start: the orientation that is turned; by default the world's axes.
+        axis: rotation axis, (3,), world frame, of any length but zero.
+        count: number of rotations, at least 1; the first is `start`.
+        start: orientation that is rotated, (3, 3), world frame; by default the identity.
+
+    Returns:
+        Rotation matrices, (count, 3, 3).
 
     Raises:
-        InputError: count is below 1, or the axis is none.
+        InputError: count is below 1, or the axis is zero or not finite.
     """
-    axis = np.asarray(axis, dtype=float)
-    if axis.shape != (3,) or not 0 < np.linalg.norm(axis) < np.inf:
-        raise InputError(f"turns(): axis is {axis.tolist()}; expected three numbers that are not all zero")
-    if not isinstance(count, int | np.integer) or count < 1:
-        raise InputError(f"turns(): count is {count}; expected a whole number of at least 1")
+    direction = np.asarray(checks.direction("turns()", "axis", axis))
+    checks.count("turns()", "count", count)
     angles = 2 * np.pi * np.arange(count) / count
-    turned = np.asarray(exp(jnp.asarray(angles[:, None] * axis / np.linalg.norm(axis))))
-    return turned if start is None else turned @ np.asarray(start)
+    rotations = np.asarray(exp(jnp.asarray(angles[:, None] * direction / np.linalg.norm(direction))))
+    return rotations if start is None else rotations @ np.asarray(start)
 
 
 @jax.jit
 def rotation_distance(R_a: Float[Array, "... 3 3"], R_b: Float[Array, "... 3 3"]) -> Float[Array, "..."]:
-    """Angle of the rotation between two rotations.
+    """Compute the angle between two rotations.
 
     Args:
-        R_a: Rotation matrices.
-        R_b: Rotation matrices; batch axes broadcast.
+        R_a: rotation matrices, (..., 3, 3).
+        R_b: rotation matrices, (..., 3, 3); batch axes broadcast.
 
     Returns:
-        Angles in [0, pi], radians. The gradient at equal rotations, where the angle has a kink, is zero.
+        Angles in [0, pi], (...), radians. The gradient at equal rotations, where the angle has a kink, is zero.
     """
     wxyz = wxyz_from_matrix(_relative(R_a, R_b))
     sine_squared = jnp.sum(wxyz[..., 1:] ** 2, axis=-1)
@@ -194,53 +196,53 @@ def rotation_distance(R_a: Float[Array, "... 3 3"], R_b: Float[Array, "... 3 3"]
 def geodesic(
     R_a: Float[Array, "... 3 3"], R_b: Float[Array, "... 3 3"], fraction: Float[Array, "..."] | float
 ) -> Float[Array, "... 3 3"]:
-    """Rotation part of the way along the shortest turn from one rotation to another.
+    """Interpolate between two rotations along the SO(3) geodesic.
 
     Args:
-        R_a: Rotation matrices at fraction 0.
-        R_b: Rotation matrices at fraction 1; batch axes broadcast.
-        fraction: Fraction of the way; batch axes broadcast.
+        R_a: rotation matrices at fraction 0, (..., 3, 3).
+        R_b: rotation matrices at fraction 1, (..., 3, 3); batch axes broadcast.
+        fraction: fraction of the geodesic, (...); batch axes broadcast.
 
     Returns:
-        Rotation matrices. Between rotations a half turn apart it is one of the two ways that exist.
+        Rotation matrices, (..., 3, 3). Between rotations that differ by a half turn they follow one of the two geodesics.
     """
     return multiply(R_a, exp(jnp.asarray(fraction)[..., None] * log(_relative(R_a, R_b))))
 
 
 @jax.jit
 def pose(R: Float[Array, "... 3 3"], t: Float[Array, "... 3"]) -> Float[Array, "... 7"]:
-    """Pose of a rotation matrix and a translation.
+    """Combine a rotation matrix and a translation into a pose.
 
     Args:
-        R: Rotation matrices.
-        t: Translations, metres; batch axes broadcast.
+        R: rotation matrices, (..., 3, 3).
+        t: translations, (..., 3), metres; batch axes broadcast.
 
     Returns:
-        Poses `wxyz_xyz` of x -> R x + t.
+        Poses `wxyz_xyz` of x -> R x + t, (..., 7).
     """
     return _join(wxyz_from_matrix(R), t)
 
 
 def rotation(wxyz_xyz: Float[Array, "... 7"]) -> Float[Array, "... 3 3"]:
-    """Rotation matrices of poses `wxyz_xyz`."""
+    """Return the rotation matrices of poses `wxyz_xyz`, (..., 3, 3)."""
     return matrix_from_wxyz(wxyz_xyz[..., :4])
 
 
 def translation(wxyz_xyz: Float[Array, "... 7"]) -> Float[Array, "... 3"]:
-    """Translations of poses `wxyz_xyz`, metres."""
+    """Return the translations of poses `wxyz_xyz`, (..., 3), metres."""
     return wxyz_xyz[..., 4:]
 
 
 @jax.jit
 def compose(a: Float[Array, "... 7"], b: Float[Array, "... 7"]) -> Float[Array, "... 7"]:
-    """Pose that applies b, then a: T_x_z = compose(T_x_y, T_y_z).
+    """Compose poses, b first: T_x_z = compose(T_x_y, T_y_z).
 
     Args:
-        a: Poses `wxyz_xyz`.
-        b: Poses `wxyz_xyz`; batch axes broadcast.
+        a: poses `wxyz_xyz`, (..., 7), metres.
+        b: poses `wxyz_xyz`, (..., 7), metres; batch axes broadcast.
 
     Returns:
-        Poses `wxyz_xyz`.
+        Poses `wxyz_xyz`, (..., 7).
     """
     w, x, y, z = (a[..., i] for i in range(4))
     p, q, r, s = (b[..., i] for i in range(4))
@@ -255,13 +257,13 @@ def compose(a: Float[Array, "... 7"], b: Float[Array, "... 7"]) -> Float[Array, 
 
 @jax.jit
 def inverse(a: Float[Array, "... 7"]) -> Float[Array, "... 7"]:
-    """Inverse poses: compose(a, inverse(a)) is the identity.
+    """Invert poses: compose(a, inverse(a)) is the identity.
 
     Args:
-        a: Poses `wxyz_xyz`.
+        a: poses `wxyz_xyz`, (..., 7), metres.
 
     Returns:
-        Poses `wxyz_xyz`.
+        Poses `wxyz_xyz`, (..., 7).
     """
     wxyz = _unit(a[..., :4] * jnp.array([1, -1, -1, -1], dtype=a.dtype))
     return _join(wxyz, -rotate(matrix_from_wxyz(wxyz), a[..., None, 4:])[..., 0, :])
@@ -269,42 +271,46 @@ def inverse(a: Float[Array, "... 7"]) -> Float[Array, "... 7"]:
 
 @jax.jit
 def transform(wxyz_xyz: Float[Array, "... 7"], x: Float[Array, "... queries 3"]) -> Float[Array, "... queries 3"]:
-    """Points carried by poses: R x + t.
+    """Transform points by poses: R x + t.
 
     Args:
-        wxyz_xyz: Poses.
-        x: Points, metres; the axes before the last two broadcast with the poses' batch axes.
+        wxyz_xyz: poses, (..., 7), metres.
+        x: points, (..., queries, 3), metres; the axes before the last two broadcast with the poses' batch axes.
 
     Returns:
-        Points, metres.
+        Points, (..., queries, 3), metres.
     """
     return rotate(rotation(wxyz_xyz), x) + wxyz_xyz[..., None, 4:]
 
 
 @jax.jit
 def rotate(R: Float[Array, "... 3 3"], x: Float[Array, "... queries 3"]) -> Float[Array, "... queries 3"]:
-    """Points turned by rotations: R x.
-
-    The components are written out: on a CPU that is six times faster than a batched 3x3 einsum.
+    """Rotate points: R x.
 
     Args:
-        R: Rotation matrices.
-        x: Points; the axes before the last two broadcast with the rotations' batch axes.
+        R: rotation matrices, (..., 3, 3).
+        x: points, (..., queries, 3); the axes before the last two broadcast with the rotations' batch axes.
 
     Returns:
-        Turned points.
+        Rotated points, (..., queries, 3).
     """
+    # The components are written out, because on a CPU that is six times faster than a batched 3x3 einsum.
     R = R[..., None, :, :]
     components = [R[..., i, 0] * x[..., 0] + R[..., i, 1] * x[..., 1] + R[..., i, 2] * x[..., 2] for i in range(3)]
     return jnp.stack(components, axis=-1)
 
 
 def multiply(R_a: Float[Array, "... 3 3"], R_b: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
-    """Rotations one after the other, the second first: R_a R_b; the default precision rounds float32 to 10 bits on some accelerators, 1e-3 radians.
+    """Multiply rotation matrices: R_a R_b, which applies R_b first.
 
     Args:
-        R_a, R_b: Rotation matrices; batch axes broadcast.
+        R_a: rotation matrices, (..., 3, 3).
+        R_b: rotation matrices, (..., 3, 3); batch axes broadcast.
+
+    Returns:
+        Rotation matrices, (..., 3, 3).
     """
+    # The default precision rounds float32 to 10 bits on some accelerators, an error of 1e-3 radians.
     return jnp.matmul(R_a, R_b, precision=jax.lax.Precision.HIGHEST)
 
 

@@ -1,4 +1,4 @@
-"""Inside and outside of a mesh, by its generalised winding number."""
+"""Points inside and outside of a mesh, by its generalised winding number."""
 
 from typing import TYPE_CHECKING
 
@@ -10,49 +10,63 @@ from tdf_jax._internal.errors import InputError
 if TYPE_CHECKING:
     import trimesh
 
-
-MOST_UNDECIDED = 0.2  # of the points not clearly outside; a mug whose handle is open at its ends has none
+# Largest fraction of undecided points among those not clearly outside. A mug whose handle is open at its ends has none.
+MAX_UNDECIDED = 0.2
 
 
 def inside(mesh: "trimesh.Trimesh", x: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, " points"] | None:
-    """Tell which points a mesh encloses, by its winding number; small holes do not matter, nor which way the faces look.
+    """Find the points that a mesh encloses, by its winding number.
+
+    Small holes do not matter, nor does the orientation of the faces.
 
     Args:
-        mesh: the surface.
-        x: spread over the mesh's bounding box and about it, in its unit.
+        mesh: surface.
+        x: points spread over the mesh's bounding box and around it, (points, 3), in the unit and frame of the mesh.
 
     Returns:
-        True inside; None for an open surface: of the points not clearly outside, more than `MOST_UNDECIDED` are not
-        clearly inside.
+        Whether each point is inside, (points,). None if the surface is open: of the points not clearly outside, more
+        than the fraction `MAX_UNDECIDED` is not clearly inside either.
 
     Raises:
         InputError: libigl is not installed.
     """
     winding = np.abs(winding_number(mesh, x))
     undecided = np.sum((winding > 0.25) & (winding < 0.75))
-    return None if undecided > MOST_UNDECIDED * np.sum(winding > 0.25) else winding > 0.5
+    return None if undecided > MAX_UNDECIDED * np.sum(winding > 0.25) else winding > 0.5
 
 
 def winding_number(mesh: "trimesh.Trimesh", x: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points"]:
-    """The generalised winding number of points: 1 inside, 0 outside, in between where a surface is open.
+    """Compute the generalised winding number: 1 inside, 0 outside, in between where a surface is open.
+
+    Args:
+        mesh: surface.
+        x: points, (points, 3), in the unit and frame of the mesh.
+
+    Returns:
+        Winding number of each point, (points,).
 
     Raises:
         InputError: libigl is not installed.
 
-    Source:
-        Barill, Dickson, Schmidt, Levin, Jacobson, Fast winding numbers for soups and clouds, SIGGRAPH 2018.
+    References:
+        Barill, Dickson, Schmidt, Levin, Jacobson, "Fast winding numbers for soups and clouds", SIGGRAPH 2018.
     """
     igl = libigl("winding_number()")
-    return igl.fast_winding_number(
-        np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64), np.asarray(x, float)
-    )
+    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
+    return np.asarray(igl.fast_winding_number(vertices, faces, np.asarray(x, float)))
 
 
 def libigl(function: str):
-    """The module of libigl, of the extra "mesh".
+    """Import libigl, which the extra "mesh" installs.
+
+    Args:
+        function: name that the error message begins with, such as "inside()".
+
+    Returns:
+        The module igl.
 
     Raises:
-        InputError: it is not installed.
+        InputError: libigl is not installed.
     """
     try:
         import igl
