@@ -1,7 +1,6 @@
-"""`tdf benchmark`: whole trajectories with known truth, by the library, the paper's energy and baselines; a page, pictures and numbers."""
+"""`tdf benchmark`: imitations of whole trajectories with ground truth, by the library, the paper's energy and baselines."""
 
 import functools
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
@@ -22,42 +21,43 @@ def benchmark(
     height: float = 0.12,
     clouds: tuple[Cloud, ...] = ("full",),
     methods: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")] = ("all",),
-    inits: int = 10,
+    num_starts: int = 10,
     meshes: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint=_NONE)] = None,
-    poses: int = 6,
+    num_poses: int = 6,
     demonstrations: Annotated[tuple[int, ...], tyro.conf.arg(metavar="INT", help_behavior_hint=_NONE)] = (),
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("benchmark"),
 ) -> None:
-    """Imitate whole trajectories on unseen mugs, goals displaced up to the opposite direction, and measure every method against the truth.
+    """Imitate whole trajectories on unseen mugs, and measure every method against the ground truth.
 
-    Writes benchmark.md, benchmark.json and pictures. Interrupted and run again, also with more pairs, clouds or
-    methods, it does only what is missing.
+    Writes benchmark.md, benchmark.json and pictures. A run that was interrupted, or that is repeated with more pairs,
+    clouds or methods, computes only what is missing.
 
     Args:
         weights: a name of shipped weights, or a .safetensors file.
-        pairs: tasks on generated mug pairs; 24 are one of each path with each goal; 0 for none, beside --meshes.
-        seed: of the mugs, poses, goals, query points and starts.
-        height: of generated mugs, metres.
-        clouds: how the new object is seen; see docs/guide/evaluation.md.
-        methods: some of those on the page, by their names there, or all.
-        inits: random starts of Adam and ICP; the library's own solver takes 64 cheap ones.
-        meshes: folder of real mugs and their meshes.json; see docs/guide/evaluation.md.
-        poses: random poses of each real mug.
-        demonstrations: also measure picks learnt from so many demonstrations, such as 1 3 5 10.
-        out: folder for the page; what was computed is kept in its folder runs.
+        pairs: number of tasks on generated pairs of mugs; 24 tasks cover every path with every goal; 0 for none, with
+            --meshes.
+        seed: seed of the mugs, poses, goals, query points and starts.
+        height: height of generated mugs, metres.
+        clouds: conditions of the new object's cloud; see docs/guide/evaluation.md.
+        methods: names of methods as on the page, or all.
+        num_starts: number of random starts of Adam and ICP; the library's own solver takes 64 coarse ones.
+        meshes: folder of real mugs with a meshes.json; see docs/guide/evaluation.md.
+        num_poses: number of random poses of each real mug.
+        demonstrations: numbers of demonstrations, such as 1 3 5 10, for picks from several demonstrations.
+        out: folder for the page; its folder runs keeps the computed attempts.
     """
     from tdf_jax._internal.errors import InputError
     from tdf_jax._internal.files import replace_file
     from tdf_jax.evaluation.annotated_meshes import load_annotated
-    from tdf_jax.evaluation.demonstration_count import learnt
-    from tdf_jax.evaluation.methods import METHODS
-    from tdf_jax.evaluation.path_page import page, record, sections
-    from tdf_jax.evaluation.path_runs import run
-    from tdf_jax.evaluation.path_scores import score
+    from tdf_jax.evaluation.demonstration_count import count_errors
+    from tdf_jax.evaluation.path_methods import METHODS
+    from tdf_jax.evaluation.path_report import page, record, sections
+    from tdf_jax.evaluation.path_scores import run, score
+    from tdf_jax.evaluation.records import write_record
     from tdf_jax.geometry.winding import libigl
     from tdf_jax.networks.checkpoint import load_model
 
-    _check(pairs, seed, height, clouds, methods, inits, meshes, poses, demonstrations)
+    _check(pairs, seed, height, clouds, methods, num_starts, meshes, num_poses, demonstrations)
     names = list(METHODS) if "all" in methods else [name for name in METHODS if name in methods]
     if meshes is not None:
         libigl("tdf benchmark")
@@ -65,38 +65,39 @@ def benchmark(
     for target in targets:
         if target.category != "mug":
             raise InputError(
-                f"tdf benchmark: --meshes has {target.name}, a {target.category}; expected mugs; tdf evaluate measures others"
+                f"tdf benchmark: --meshes has {target.name}, a {target.category}; expected mugs; tdf evaluate measures "
+                "other objects"
             )
     model = load_model(weights)
     folder = _folder(out)
     makers = [
-        make for condition in dict.fromkeys(clouds) for make in _makers(pairs, seed, height, condition, targets, poses)
+        make
+        for condition in dict.fromkeys(clouds)
+        for make in _makers(pairs, seed, height, condition, targets, num_poses)
     ]
     scores = [
         score(method, attempt, task)
-        for task, method, attempt in run(makers, model, names, folder, seed=seed, inits=inits)
+        for task, method, attempt in run(makers, model, names, folder, seed=seed, num_starts=num_starts)
     ]
     if not scores:
         raise InputError(
-            "tdf benchmark: none of --methods can be tried on these objects; the oracle needs generated mugs, and variants some of every fifth task"
+            "tdf benchmark: none of --methods can run on these objects; the oracle needs generated mugs, and variants "
+            "run on every fifth task"
         )
     settings = {
-        "weights": weights, "pairs": pairs, "seed": seed, "height": height, "clouds": clouds, "methods": methods, "inits": inits,
-        "meshes": None if meshes is None else str(meshes), "poses": poses, "demonstrations": demonstrations,
+        "weights": weights, "pairs": pairs, "seed": seed, "height": height, "clouds": clouds, "methods": methods,
+        "num_starts": num_starts, "meshes": None if meshes is None else str(meshes), "num_poses": num_poses,
+        "demonstrations": demonstrations,
     }  # fmt: skip
-    picks = learnt(makers, model, demonstrations, folder, seed=seed)
+    picks = count_errors(makers, model, demonstrations, folder, seed=seed)
     extras = sections(scores, picks)
     _draw(out, makers, scores, extras)
-    replace_file(
-        "tdf benchmark",
-        out / RECORD,
-        (json.dumps(record(scores, model, settings, extras), allow_nan=False) + "\n").encode(),
-    )
+    write_record("tdf benchmark", out / RECORD, record(scores, model, settings, extras), indent=None)
     replace_file("tdf benchmark", out / PAGE, page(scores, model, settings, extras).encode())
     print(out / PAGE)
 
 
-def _makers(pairs, seed, height, clouds, targets, poses) -> list[Callable]:
+def _makers(pairs, seed, height, clouds, targets, num_poses) -> list[Callable]:
     from tdf_jax.evaluation.cases import mesh_case, mug_case
     from tdf_jax.evaluation.path_tasks import make_task, mesh_index
 
@@ -108,18 +109,19 @@ def _makers(pairs, seed, height, clouds, targets, poses) -> list[Callable]:
             mesh_case(seed, pose, targets[number], clouds=clouds), seed, mesh_index(targets[number].name, pose)
         )
 
-    meshes = [functools.partial(real, number, pose) for number in range(len(targets)) for pose in range(poses)]
+    meshes = [functools.partial(real, number, pose) for number in range(len(targets)) for pose in range(num_poses)]
     return [functools.partial(generated, index) for index in range(pairs)] + meshes
 
 
 def _draw(out, makers, scores, extras) -> None:
-    from tdf_jax.evaluation.methods import LIBRARY
-    from tdf_jax.evaluation.path_page import PICTURES
+    from tdf_jax.evaluation.path_methods import LIBRARY
+    from tdf_jax.evaluation.path_report import PICTURES
     from tdf_jax.geometry.paths import PATHS
     from tdf_jax.viz.evaluation import demonstrations_figure, errors_figure, reliability_figure, truth_figure
     from tdf_jax.viz.style import save_figure
 
-    # The first six tasks are one of each path, not displaced; later ones show where goals go.
+    # The first six tasks are one of each path with the goal not displaced. Later tasks with the same path are drawn
+    # instead where there are some, because they show the displaced goals.
     kinds = len(PATHS)
     shown = [
         makers[index + index % 4 * kinds if index + index % 4 * kinds < len(makers) else index]
@@ -135,12 +137,13 @@ def _draw(out, makers, scores, extras) -> None:
 
 
 def _folder(out: Path) -> Path:
-    """The folder of what was computed, made now: an hour of work is lost where it cannot be."""
+    """The folder of computed attempts, made at the start: an error at the end would lose an hour of work."""
     from tdf_jax._internal.errors import InputError
 
     if (out / PAGE).exists() and not (out / RECORD).exists():
         raise InputError(
-            f"tdf benchmark: {out / PAGE} is not of an earlier benchmark, there is no {RECORD} beside it; expected another --out: nothing of yours is overwritten"
+            f"tdf benchmark: {out / PAGE} is not of an earlier benchmark, there is no {RECORD} beside it; expected another "
+            "--out: nothing of yours is overwritten"
         )
     try:
         (out / RUNS).mkdir(parents=True, exist_ok=True)
@@ -149,10 +152,10 @@ def _folder(out: Path) -> Path:
     return out / RUNS
 
 
-def _check(pairs, seed, height, clouds, methods, inits, meshes, poses, demonstrations) -> None:
+def _check(pairs, seed, height, clouds, methods, num_starts, meshes, num_poses, demonstrations) -> None:
     from tdf_jax._internal.errors import InputError
     from tdf_jax.evaluation.demonstration_count import MOST
-    from tdf_jax.evaluation.methods import METHODS
+    from tdf_jax.evaluation.path_methods import METHODS
 
     def need(truth, what):
         if not truth:
@@ -164,13 +167,14 @@ def _check(pairs, seed, height, clouds, methods, inits, meshes, poses, demonstra
     )
     need(0 <= seed < 2**32, f"--seed is {seed}; expected 0 to {2**32 - 1}")
     need(0.01 <= height <= 1.0, f"--height is {height}; expected metres between 0.01 and 1")
-    need(inits >= 1, f"--inits is {inits}; expected at least 1")
-    need(poses >= 1, f"--poses is {poses}; expected at least 1")
+    need(num_starts >= 1, f"--num-starts is {num_starts}; expected at least 1")
+    need(num_poses >= 1, f"--num-poses is {num_poses}; expected at least 1")
     need(clouds, "--clouds is empty; expected at least one condition, such as full")
     unknown = [name for name in methods if name not in (*METHODS, "all")]
     need(
         methods and not unknown,
-        f"--methods has {', '.join(map(repr, unknown)) or 'none'}; expected all, or some of {', '.join(map(repr, METHODS))}",
+        f"--methods has {', '.join(map(repr, unknown)) or 'none'}; expected all, or some of "
+        f"{', '.join(map(repr, METHODS))}",
     )
     need(
         all(1 <= count <= MOST for count in demonstrations),

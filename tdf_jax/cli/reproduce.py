@@ -1,4 +1,4 @@
-"""`tdf reproduce`: the paper's table and figures."""
+"""`tdf reproduce`: the table and the figures of the paper."""
 
 import dataclasses
 from collections.abc import Callable, Iterable
@@ -17,7 +17,7 @@ from tdf_jax.paper.setting import Setting, scene
 from tdf_jax.paper.store import Store
 
 EXPERIMENTS = ("table1", "fig1", "fig2", "fig3", "fig4", "fig5")
-# What each sets itself; "all" is all of them.
+# Settings that an experiment chooses itself. "all" chooses all of them.
 CHOSEN = {
     "table1": ("trajectory", "displacement"),
     "fig1": (),
@@ -28,7 +28,7 @@ CHOSEN = {
 }
 RUNS = "runs"  # folder of what was computed
 GRID, FAST_GRID = 101, 31
-FAST = {"inits": 2, "iterations": 60, "queries": 24}
+FAST = {"num_starts": 2, "iterations": 60, "queries": 24}
 
 
 def reproduce(
@@ -38,22 +38,22 @@ def reproduce(
     weights: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "mug",
     setting: Annotated[Setting, tyro.conf.arg(name="")] = Setting(),
 ) -> None:
-    """Regenerate the paper's table and figures with mugs of the library's own; docs/results/paper.md explains every number.
+    """Regenerate the table and the figures of the paper with generated mugs; docs/results/paper.md explains the numbers.
 
-    Interrupted and run again, it does only what is missing.
+    A run that was interrupted computes only what is missing.
 
     Args:
-        experiment: which one.
-        out: folder for the pictures and tables; what was computed is kept in its folder runs.
-        fast: fewer seeds and grid points, and fewer starts, iterations and query points where those are not set: a look
-            at everything in minutes.
+        experiment: table or figure of the paper, or all.
+        out: folder for the pictures and tables; its folder runs keeps the computed runs.
+        fast: use fewer seeds and grid points, and, unless they are set, fewer starts, iterations and query points; all
+            experiments then take minutes.
         weights: a name of shipped weights, or a .safetensors file.
-        setting: what all experiments start from; each changes what it is about.
+        setting: settings that all experiments share; each experiment changes some of them.
     """
     names = EXPERIMENTS if experiment == "all" else (experiment,)
     for name in dict.fromkeys(field for one in names for field in CHOSEN[one]):
         if getattr(setting, name) != getattr(Setting(), name):
-            raise InputError(f"tdf reproduce: --{name} is set, but {experiment} chooses it itself; drop it")
+            raise InputError(f"tdf reproduce: --{name.replace('_', '-')} is set, but {experiment} chooses it itself; drop it")
     if fast:
         untouched = {name: value for name, value in FAST.items() if getattr(setting, name) == getattr(Setting(), name)}
         setting = dataclasses.replace(setting, **untouched)
@@ -123,7 +123,7 @@ _COMMANDS: dict[str, Callable] = dict(zip(EXPERIMENTS, (_table1, _fig1, _fig2, _
 
 
 def _run_all(store: Store, settings, words: str) -> dict[object, Run]:
-    """Runs of settings, with a progress bar: a mapping's by its names, a sequence's by their number."""
+    """Runs of settings, with a progress bar; those of a mapping by its keys, those of a sequence by their number."""
     named = settings if isinstance(settings, dict) else dict(enumerate(settings))
     with tqdm(total=len(named), desc=words, unit="run") as bar:
 

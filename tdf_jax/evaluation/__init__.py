@@ -1,25 +1,27 @@
-"""How good weights and methods are, on cases with ground truth.
+"""Accuracy of weights and methods on cases with ground truth.
+
+`tdf evaluate` measures the transfer of one pose (`pick_*`), `tdf benchmark` the imitation of a whole trajectory
+(`path_*`). Both share the cases, the metrics, the statistics, the tables and the records.
 
 Modules:
     annotated_meshes: real meshes with their sidecar
-    axis_profiles: places of bowls and bottles, measured
+    axis_profiles: measured places of bowls and bottles
     baselines: principal axes and ICP
     cases: pairs of objects with a true pose
-    comparison: a network beside baselines
-    conditions: complete, partial, sparse and noisy clouds
     clearance_study: colliding paths in random scenes, pushed clear
+    conditions: complete, partial, sparse and noisy clouds
     demonstration_count: picks from several demonstrations
-    methods: methods that imitate a whole trajectory
-    metrics: errors of poses, paths and motions
-    model_card: the card of weights
-    path_page: the page of `tdf benchmark`
-    path_runs: every method on every task, kept between runs
-    path_scores: scores of whole trajectories
-    path_tasks: tasks: a demonstration, a target, a goal, the truth
-    pick_transfer: one pose transferred; reconstruction
-    places: places of a mug, measured
-    recognition_study: objects of another category, recognised by the match
-    report: table and file of `tdf evaluate`
+    metrics: errors of poses and paths
+    path_methods: methods that imitate a whole trajectory
+    path_report: page and record of `tdf benchmark`
+    path_scores: attempts of every method on every task, and their errors
+    path_tasks: tasks: a demonstration, a target, a goal, the ground truth
+    pick_report: table, model card and record of `tdf evaluate`
+    pick_transfer: one pose, transferred by a network and by baselines
+    places: measured places of a mug
+    recognition_study: recognition of objects of another category
+    records: header of JSON records
     scene: a demonstration and a target in one world
-    statistics: medians, success rates, intervals
+    statistics: success thresholds and bootstrap intervals
+    tables: tables as Markdown and as text
 """

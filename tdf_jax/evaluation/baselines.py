@@ -1,7 +1,7 @@
-"""What the network has to beat: rigid alignment of the two clouds, which needs no training.
+"""Baselines without training: rigid alignment of the two clouds.
 
-A baseline finds T_b_a, the motion of object a in its canonical frame onto object b's cloud in the world, and carries
-the place's pose by it. Both objects are mugs of one height, but not the same mug: even the best motion leaves an error.
+A baseline estimates T_b_a, the motion of object a in its canonical frame onto the cloud of object b in the world, and
+moves the pose of the place by it. The objects have one size but not one shape, so even the best motion has an error.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from tqdm import tqdm
 
-from tdf_jax._internal.errors import InputError
+from tdf_jax._internal import checks
 from tdf_jax.evaluation.cases import Case
 from tdf_jax.geometry import se3
 
@@ -20,18 +20,19 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 METHODS = ("PCA", "ICP")
-STEPS = 100  # of ICP, at most
-SETTLED = 1e-4  # of ICP's cost, a mean squared distance: a step that lowers it by no more is the last
+MAX_STEPS = 100  # of ICP
+TOLERANCE = 1e-4  # ICP stops at a step that lowers its mean squared distance by no more than this share
 SIGNS = np.array([(x, y, x * y) for x in (1, -1) for y in (1, -1)])  # of principal axes, without reflections
 
 
 def principal_axes(
     points_a: Float[np.ndarray, "points 3"], points_b: Float[np.ndarray, "seen 3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Alignment of centroids and principal axes; of the four choices of signs, the one of least chamfer distance.
+    """Align centroids and principal axes; of the four choices of signs, take the one with the smallest chamfer distance.
 
     Args:
-        points_a, points_b: clouds, metres.
+        points_a: cloud of object a, (points, 3), metres.
+        points_b: cloud of object b, (seen, 3), metres.
 
     Returns:
         The motion of cloud a onto cloud b, 4x4.
@@ -50,13 +51,14 @@ def iterative_closest_points(
     points_b: Float[np.ndarray, "seen 3"],
     rotations: Float[np.ndarray, "starts 3 3"],
 ) -> Float[np.ndarray, "4 4"]:
-    """Point-to-point ICP from several starts; the one of least mean squared distance.
+    """Point-to-point ICP from several starts; take the start with the smallest mean squared distance.
 
-    Every point of cloud b, which may be a part, is matched with its nearest in cloud a, which is complete.
+    Every point of cloud b, which may be partial, is matched with its nearest point of cloud a, which is complete.
 
     Args:
-        points_a, points_b: clouds, metres.
-        rotations: of cloud a about its centroid, laid on cloud b's; where the starts begin.
+        points_a: cloud of object a, (points, 3), metres.
+        points_b: cloud of object b, (seen, 3), metres.
+        rotations: initial rotations of cloud a about its centroid, (starts, 3, 3); the centroids coincide.
 
     Returns:
         The motion of cloud a onto cloud b, 4x4.
@@ -64,19 +66,22 @@ def iterative_closest_points(
     Source:
         Besl and McKay, A method for registration of 3-D shapes, PAMI 1992.
     """
-    motions, costs = settled_points(points_a, points_b, rotations)
+    motions, costs = every_registration(points_a, points_b, rotations)
     return motions[int(np.argmin(costs))]
 
 
-def settled_points(
+def every_registration(
     points_a: Float[np.ndarray, "points 3"],
     points_b: Float[np.ndarray, "seen 3"],
     rotations: Float[np.ndarray, "starts 3 3"],
 ) -> tuple[Float[np.ndarray, "starts 4 4"], Float[np.ndarray, " starts"]]:
-    """Where point-to-point ICP settles from every start, see `iterative_closest_points`.
+    """The result of point-to-point ICP from every start.
+
+    Args:
+        points_a, points_b, rotations: as for `iterative_closest_points`.
 
     Returns:
-        Motions of cloud a onto cloud b, 4x4, and their mean squared distances, square metres.
+        Motions of cloud a onto cloud b, (starts, 4, 4), and their mean squared distances, (starts,), square metres.
     """
     from scipy.spatial import cKDTree
 
@@ -90,7 +95,15 @@ def settled_points(
 def rigid_motion(
     points_a: Float[np.ndarray, "points 3"], points_b: Float[np.ndarray, "points 3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """The motion of least squares of points onto those they correspond to, 4x4, without reflection or scale."""
+    """The least-squares motion of points onto corresponding points, without reflection or scale.
+
+    Args:
+        points_a: points that move, (points, 3), metres.
+        points_b: corresponding points, (points, 3), metres.
+
+    Returns:
+        The motion, 4x4.
+    """
     from trimesh.registration import procrustes
 
     return procrustes(points_a, points_b, reflection=False, scale=False)[0]
@@ -99,11 +112,12 @@ def rigid_motion(
 def chamfer_distance(
     points_a: Float[np.ndarray, "points 3"], points_b: Float[np.ndarray, "seen 3"], tree_b: "cKDTree | None" = None
 ) -> float:
-    """Mean distance of points to their nearest in the other cloud, metres, averaged over both directions.
+    """Mean distance of points to their nearest neighbours in the other cloud, metres, averaged over both directions.
 
     Args:
-        points_a, points_b: clouds.
-        tree_b: of `points_b`, if there is one already.
+        points_a: one cloud, (points, 3), metres.
+        points_b: the other cloud, (seen, 3), metres.
+        tree_b: search tree of `points_b`, if there is one already.
     """
     from scipy.spatial import cKDTree
 
@@ -112,45 +126,44 @@ def chamfer_distance(
 
 
 def aligned(
-    method: str, cases: Sequence[Case], *, seed: int = 0, inits: int = 10, progress: bool = True
+    method: str, cases: Sequence[Case], *, seed: int = 0, num_starts: int = 10, progress: bool = True
 ) -> Float[np.ndarray, "cases 7"]:
-    """The place's pose carried by a baseline, in every case.
+    """Transfer the pose at the place by a baseline, in every case.
 
     Args:
         method: "PCA" or "ICP".
-        cases: what to transfer.
-        seed: of ICP's starts.
-        inits: ICP's starts, uniform rotations.
+        cases: the transfers.
+        seed: seed of ICP's starts.
+        num_starts: number of ICP's starts, uniform rotations.
         progress: show a progress bar.
 
     Returns:
-        Poses `wxyz_xyz` of the place, as found on object b, world frame.
+        Estimated poses `wxyz_xyz` of the place on object b, (cases, 7), metres, world frame.
 
     Raises:
         InputError: there is no such method.
     """
-    if method not in METHODS:
-        raise InputError(f"aligned(): method is {method!r}; expected one of {', '.join(METHODS)}")
+    checks.choice("aligned()", "method", method, METHODS)
     _, start_key = jax.random.split(jax.random.key(seed))
-    found = []
+    estimates = []
     for index, case in enumerate(tqdm(cases, desc=method, disable=not progress)):
         if method == "PCA":
             T_b_a = principal_axes(case.points_a, case.points_b)
         else:
-            rotations = np.asarray(se3.uniform_rotations(jax.random.fold_in(start_key, index), inits), float)
+            rotations = np.asarray(se3.uniform_rotations(jax.random.fold_in(start_key, index), num_starts), float)
             T_b_a = iterative_closest_points(case.points_a, case.points_b, rotations)
-        found.append(T_b_a @ case.T_world_place_a)
-    found = np.stack(found).astype(np.float32)
-    return np.asarray(se3.pose(found[:, :3, :3], found[:, :3, 3]))
+        estimates.append(T_b_a @ case.T_world_place_a)
+    T_world_place = np.stack(estimates).astype(np.float32)
+    return np.asarray(se3.pose(T_world_place[:, :3, :3], T_world_place[:, :3, 3]))
 
 
 def _icp(T_a_b, points_a, points_b, tree_a):
-    """The motion that settles, and its cost."""
+    """The motion at convergence, and its mean squared distance."""
     cost = np.inf
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         distances, nearest = tree_a.query(_moved(T_a_b, points_b))
         before, cost = cost, float(np.mean(distances**2))
-        if cost >= (1 - SETTLED) * before:
+        if cost >= (1 - TOLERANCE) * before:
             break
         T_a_b = rigid_motion(points_b, points_a[nearest])
     return T_a_b, cost

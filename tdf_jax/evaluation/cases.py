@@ -1,37 +1,47 @@
-"""Pairs of objects with a demonstrated pose on one and the true pose on the other."""
+"""Cases with ground truth: a demonstration on one object, and another object with the true pose of the same place."""
 
 import dataclasses
 import zlib
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.annotated_meshes import AnnotatedMesh
 from tdf_jax.evaluation.conditions import CONDITIONS, SCALES, observed
 from tdf_jax.geometry import se3
+from tdf_jax.geometry.demonstration import Demonstration
+from tdf_jax.geometry.paths import PATHS, SHAPES
 from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.shapes import FAMILIES, Mug, Shape, scaled
 
-SEED_SPACE = 7_000_001  # keeps evaluation objects apart from training's, which are drawn from [seed, index]
-# Folded into the key of random poses: start m of a seed is drawn from fold_in(key(seed), m), and must not be the true
+QUERIES = 128
+QUERY_SIZE = 0.06  # metres, edge of the box of query points: it holds the handle and the wall behind it
+PLACE = (0.0, 0.24, 0.18)  # metres from the pick to the goal: to the side and up
+LIFT = (0.0, 0.0, 1.0)  # a semicircle and a wave leave the straight line upwards first
+# Evaluation objects are drawn from [SEED_SPACE, seed, index] and training objects from [seed, index], so no object is
+# in both.
+SEED_SPACE = 7_000_001
+# Folded into the key of random poses. Start m of a seed is drawn from fold_in(key(seed), m), and must not be the true
 # rotation.
 POSE_STREAM = 0x7D05E
 
 
 @dataclasses.dataclass(frozen=True)
 class Transfer:
-    """A pose demonstrated on one object, to be found on another, in the world.
+    """A pose that is demonstrated on object a and is to be estimated on object b.
 
     Attributes:
-        points_a: cloud of the demonstration's object, which lies in its canonical frame, (points, 3), metres.
-        points_b: cloud of the new object, in a random pose.
-        T_world_place_a: the semantic place on object a, 4x4.
-        T_world_place_b: the same place on object b: the truth, or one of several that object b's symmetry makes equal.
-        T_world_b: pose of object b's canonical frame, 4x4.
-        fold: object b's symmetry about the z axis of that frame, see `tdf_jax.symmetry`.
-        scale: of both objects, and so of the query, over a common size.
+        points_a: cloud of the demonstrated object, (points, 3), metres, world frame; its canonical frame is the world
+            frame.
+        points_b: cloud of the new object in a random pose, (seen, 3), metres, world frame.
+        T_world_place_a: semantic place on object a, 4x4.
+        T_world_place_b: the same place on object b, 4x4: the ground truth, or one of several that the symmetry of
+            object b makes equal.
+        T_world_b: pose of the canonical frame of object b, 4x4.
+        fold: symmetry of object b about the z axis of that frame, see `tdf_jax.geometry.symmetry`.
+        scale: size of both objects over a common size; it scales the query points too.
     """
 
     points_a: Float[np.ndarray, "points 3"]
@@ -45,12 +55,12 @@ class Transfer:
 
 @dataclasses.dataclass(frozen=True)
 class Case(Transfer):
-    """A transfer between objects whose shapes are known; `points_b` is as `clouds` says.
+    """A transfer between objects whose shapes are known.
 
     Attributes:
         object_a, object_b: the objects, in their canonical frames.
         instance: name of object b; cases of one object in several poses share it.
-        clouds: the condition of `points_b`, one of `tdf_jax.evaluation.conditions.CONDITIONS`.
+        clouds: condition of `points_b`, one of `tdf_jax.evaluation.conditions.CONDITIONS`.
     """
 
     object_a: Shape
@@ -60,23 +70,26 @@ class Case(Transfer):
 
     @property
     def diagonal(self) -> float:
-        """Of object b's bounding box, metres."""
+        """Diagonal of the bounding box of object b, metres."""
         return float(np.linalg.norm(self.object_b.mesh.extents))
 
 
 def size_of(one: Shape | AnnotatedMesh) -> float:
-    """What objects of a category are compared by, metres: a mug's height, the diagonal of others, which may be shallow or deep."""
+    """The length by which objects of a category are compared, metres.
+
+    It is the height of a mug, and the diagonal of other objects, which may be shallow or deep.
+    """
     return one.height if one.category == "mug" else float(np.linalg.norm(one.mesh.extents))
 
 
 def object_of(category: str, seed: int, index: int, size: float, fold: int | None = None) -> Shape:
-    """A generated object no training run saw.
+    """A generated object that no training run has.
 
     Args:
-        category: its family.
-        seed, index: which.
-        size: see `size_of`, metres.
-        fold: its symmetry; any by default.
+        category: family of the object.
+        seed, index: number of the object.
+        size: size, see `size_of`, metres.
+        fold: symmetry of the object; any by default.
     """
     family, rng = FAMILIES[category], np.random.default_rng([SEED_SPACE, seed, index])
     parameters = family.sample(rng)
@@ -87,12 +100,12 @@ def object_of(category: str, seed: int, index: int, size: float, fold: int | Non
 
 
 def mug_of(seed: int, index: int, height: float) -> Mug:
-    """A generated mug no training run saw, scaled to a height in metres."""
+    """A generated mug that no training run has, scaled to a height in metres."""
     return object_of("mug", seed, index, height)
 
 
 def random_pose(seed: int, index: int, reach: float = 0.3) -> Float[np.ndarray, "4 4"]:
-    """A rotation uniform on SO(3) and a translation uniform in a cube of half side `reach`, metres."""
+    """A random pose, 4x4: uniform on SO(3), and uniform in a cube whose half edge is `reach`, metres."""
     rotation_key, place_key = jax.random.split(
         jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), POSE_STREAM), index)
     )
@@ -112,15 +125,16 @@ def generated_case(
     place: str | None = None,
     clouds: str = "full",
 ) -> Case:
-    """Pair `index` of a seed: two unseen generated objects of one size and symmetry, the second under a random pose.
+    """Pair `index` of a seed: two unseen generated objects of one size and symmetry, the second in a random pose.
 
     Args:
         category: "mug", "bowl" or "bottle".
-        seed, index: which pair.
-        size: of both objects before a condition of size, see `size_of`; by default a common one's.
-        points: of each complete cloud, uniform by area.
-        place: name of a frame of the category; by default the one where demonstrations pick it.
-        clouds: the condition of the second object's cloud; objects and poses do not depend on it.
+        seed, index: number of the pair.
+        size: size of both objects before a condition of size, see `size_of`, metres; by default the common size of the
+            category.
+        points: number of points of each complete cloud, uniform by area.
+        place: name of a frame of the category; by default the frame at which demonstrations pick.
+        clouds: condition of the second object's cloud; objects and poses do not depend on it.
 
     Raises:
         InputError: there is no such condition or place.
@@ -142,10 +156,13 @@ def mug_case(
 def mesh_case(
     seed: int, pose: int, target: AnnotatedMesh, *, points: int = 1500, place: str | None = None, clouds: str = "full"
 ) -> Case:
-    """Random pose `pose` of a real mesh at its own size, demonstrated on an unseen generated object of its category, size and symmetry.
+    """A real mesh at its own size in a random pose, with a demonstration on an unseen generated object.
+
+    The generated object has the category, the size and the symmetry of the mesh.
 
     Args:
-        seed, pose: which object and pose; they depend on the mesh's name too, but not on other meshes.
+        seed, pose: number of the pose. The pose and the generated object depend on the name of the mesh too, but not on
+            other meshes.
         target: the mesh.
         points, place, clouds: see `generated_case`.
 
@@ -157,6 +174,30 @@ def mesh_case(
     b = target if scale == 1 else target.scaled(scale)
     a = object_of(b.category, seed, number, size_of(b), b.fold)
     return _case(a, b, seed, number, points, place, clouds, target.name)
+
+
+def place_demonstration(
+    case: Case,
+    path: str,
+    num_poses: int,
+    query: Float[Array, "queries 3"],
+    goal_offset: tuple[float, float, float] = PLACE,
+    bulge: tuple[float, float, float] | None = LIFT,
+) -> Demonstration:
+    """A demonstrated trajectory on the first object of a case, from its place (such as the handle) to a goal.
+
+    Args:
+        case: the case.
+        path: name of the path, one of `tdf_jax.geometry.paths.PATHS`.
+        num_poses: number of poses of the trajectory.
+        query: query points, (queries, 3), metres, query frame.
+        goal_offset: translation from the first pose to the last, (3,), metres, world frame; it scales with the case.
+        bulge: side to which a semicircle and a wave leave the straight line, (3,); None for the default of the path.
+    """
+    pick = case.T_world_place_a
+    start, end = pick[:3, 3], pick[:3, 3] + np.multiply(goal_offset, case.scale)
+    bow = {} if bulge is None or path not in SHAPES or path == "line" else {"bulge": bulge}
+    return Demonstration(case.points_a, PATHS[path](num_poses, start, end, rotation=pick[:3, :3], **bow), query)
 
 
 def _scale(function: str, clouds: str) -> float:
@@ -181,7 +222,7 @@ def _case(
         raise InputError(f"generated_case(): place is {place!r}; expected one of a {a.category}'s: {', '.join(places)}")
     rng = np.random.default_rng([SEED_SPACE, seed, number, 1])
     cloud_a, cloud_b = (sample_surface(one.mesh, points, rng) for one in (a, b))
-    # A stream of its own, the same for all conditions: they differ by the condition, not by chance.
+    # All conditions share this random stream, so that they differ by the condition and not by chance.
     seen = observed(b.mesh, clouds, cloud_b, np.random.default_rng([SEED_SPACE, seed, number, 2]))
     T_world_b = random_pose(seed, number)
     points_b = seen @ T_world_b[:3, :3].T + T_world_b[:3, 3]

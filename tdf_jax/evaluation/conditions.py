@@ -1,4 +1,4 @@
-"""Conditions under which the new object's cloud is taken: complete, seen by cameras, sparse, noisy, of another size."""
+"""Conditions of the new object's cloud: complete, seen by cameras, sparse, noisy, or of another size."""
 
 from typing import TYPE_CHECKING
 
@@ -16,22 +16,22 @@ SPARSE = {"points300": 300, "points1000": 1000, "points3000": 3000, "noise": 300
 SCALES = {"half": 0.5, "double": 2.0}
 CONDITIONS = ("full", *VIEWS, *SPARSE, *SCALES)
 NOISE = 0.002  # metres, standard deviation along each axis
-SURFACE = 12_000  # points that cameras look at; the least seen side of a mug shows about an eighth of them
+SURFACE = 12_000  # surface points that cameras may see; one camera sees an eighth of them or more
 
 
 def observed(
     mesh: "trimesh.Trimesh", condition: str, full: Float[np.ndarray, "points 3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "seen 3"]:
-    """The cloud of an object under a condition, in the object's frame.
+    """The cloud of an object under a condition.
 
     Args:
-        mesh: the object; of its final size for "half" and "double".
+        mesh: mesh of the object, metres, object frame; for "half" and "double" it already has that size.
         condition: one of `CONDITIONS`.
-        full: the complete cloud, returned as it is where the condition is one of size.
-        rng: draws the cameras, points and noise of the others.
+        full: complete cloud, (points, 3), metres, object frame; returned unchanged for conditions of size.
+        rng: generator of the cameras, points and noise.
 
     Returns:
-        Points, metres: as many as `full` has where cameras see so many.
+        Points, (seen, 3), metres, object frame; at most as many as `full` has if cameras see the object.
     """
     if condition in VIEWS:
         surface = sample_surface(mesh, SURFACE, rng)

@@ -1,4 +1,4 @@
-"""What an imitation ought to be, where both objects carry semantic frames, and how far a pose is from it."""
+"""The expected imitation where both objects have semantic frames, and errors of poses and paths."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,8 +11,8 @@ from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.geometry.transport import carry_trajectory
 from tdf_jax.shapes import Mug
 
-REACH = 0.03  # metres from a place at which its equivalents are compared; half of a query box
-FLIP_DEGREES = 170.0  # rotation errors above it are counted apart: the object was taken for its mirror image
+REACH = 0.03  # metres from a place at which equivalent places are compared; half the edge of a query box
+FLIP_DEGREES = 170.0  # a larger rotation error is a flip: the method mistook the object for its mirror image
 
 
 def expected_trajectory(
@@ -21,16 +21,16 @@ def expected_trajectory(
     T_world_place_b: Float[np.ndarray, "4 4"],
     goal: Float[Array, "7"],
 ) -> Trajectory:
-    """The demonstrated trajectory as it ought to be on another object.
+    """The ground truth of an imitation on another object.
 
-    With A the motion of the semantic place (say, the handle) from object a to object b, the first pose becomes A T_0
-    and the last the goal; between them the demonstration is carried as `carry_trajectory` says. It is a definition:
-    where object and goal moved differently, no way between them is the only right one.
+    The motion A of the semantic place (such as the handle) from object a to object b moves the first pose T_0 to A T_0.
+    The last pose is the goal. Between them, the demonstration is warped as `carry_trajectory` says. This is a
+    definition: if object and goal move differently, several paths between them are equally right.
 
     Args:
         demonstrated: T_world_query on object a.
-        T_world_place_a: frame of the place on object a.
-        T_world_place_b: frame of the same place on object b.
+        T_world_place_a: frame of the place on object a, 4x4.
+        T_world_place_b: frame of the same place on object b, 4x4.
         goal: last pose on object b, `wxyz_xyz`.
 
     Returns:
@@ -43,17 +43,17 @@ def expected_trajectory(
 
 def nearest_place(
     T_world_object: Float[np.ndarray, "4 4"],
-    T_world_found: Float[np.ndarray, "4 4"],
+    T_world_estimate: Float[np.ndarray, "4 4"],
     T_world_place: Float[np.ndarray, "4 4"],
     fold: int,
 ) -> Float[np.ndarray, "4 4"]:
-    """Of the places that an object's symmetry makes equal, the one nearest to where one was found.
+    """Of the places that the symmetry of an object makes equal, the one nearest to an estimate.
 
     Args:
-        T_world_object: pose of the object's canonical frame.
-        T_world_found: of the place, as found.
-        T_world_place: of one true place.
-        fold: the object's symmetry, see `tdf_jax.symmetry`.
+        T_world_object: pose of the object's canonical frame, 4x4.
+        T_world_estimate: estimated pose of the place, 4x4.
+        T_world_place: one true pose of the place, 4x4.
+        fold: symmetry of the object, see `tdf_jax.geometry.symmetry`.
 
     Returns:
         T_world_place, 4x4.
@@ -61,52 +61,55 @@ def nearest_place(
     if fold == 1:
         return T_world_place
     to_object = np.linalg.inv(T_world_object)
-    found = to_object @ np.asarray(T_world_found, float)
-    return T_world_object @ equivalent(found, to_object @ T_world_place, fold, REACH)
+    estimate = to_object @ np.asarray(T_world_estimate, float)
+    return T_world_object @ equivalent(estimate, to_object @ T_world_place, fold, REACH)
 
 
-def pose_error(found: Float[Array, "... 7"], truth: Float[Array, "... 7"]) -> tuple[np.ndarray, np.ndarray]:
-    """Distance of translations, metres, and of rotations, radians.
+def pose_error(estimate: Float[Array, "... 7"], truth: Float[Array, "... 7"]) -> tuple[np.ndarray, np.ndarray]:
+    """Position errors, metres, and rotation errors, radians.
 
     Args:
-        found, truth: poses `wxyz_xyz`; batch axes broadcast.
+        estimate: estimated poses `wxyz_xyz`, (..., 7).
+        truth: true poses `wxyz_xyz`, (..., 7); batch axes broadcast.
     """
-    found, truth = jnp.asarray(found), jnp.asarray(truth)
-    distance = jnp.linalg.norm(se3.translation(found) - se3.translation(truth), axis=-1)
-    return np.asarray(distance), np.asarray(se3.rotation_distance(se3.rotation(found), se3.rotation(truth)))
+    estimate, truth = jnp.asarray(estimate), jnp.asarray(truth)
+    distance = jnp.linalg.norm(se3.translation(estimate) - se3.translation(truth), axis=-1)
+    return np.asarray(distance), np.asarray(se3.rotation_distance(se3.rotation(estimate), se3.rotation(truth)))
 
 
-def path_error(found: Trajectory, truth: Trajectory) -> float:
+def path_error(estimate: Trajectory, truth: Trajectory) -> float:
     """Mean distance of waypoints, metres."""
-    return float(np.mean(pose_error(found.wxyz_xyz, truth.wxyz_xyz)[0]))
+    return float(np.mean(pose_error(estimate.wxyz_xyz, truth.wxyz_xyz)[0]))
 
 
-def shape_error(found: Float[np.ndarray, "poses 3"], truth: Float[np.ndarray, "poses 3"]) -> float:
-    """How far a path has another shape: root mean square distance of waypoints after the best rigid motion onto the truth, metres.
+def shape_error(estimate: Float[np.ndarray, "poses 3"], truth: Float[np.ndarray, "poses 3"]) -> float:
+    """Difference of the shapes of two paths: root mean square distance of waypoints after the best rigid motion, metres.
 
     Args:
-        found, truth: translations of the waypoints, metres.
+        estimate: translations of the estimated waypoints, (poses, 3), metres.
+        truth: translations of the true waypoints, (poses, 3), metres.
     """
-    found, truth = (np.asarray(path, float) - np.mean(path, axis=0, dtype=float) for path in (found, truth))
-    left, values, right = np.linalg.svd(found.T @ truth)
-    # Proper rotations only: a wave is not its mirror image.
+    estimate, truth = (np.asarray(path, float) - np.mean(path, axis=0, dtype=float) for path in (estimate, truth))
+    left, values, right = np.linalg.svd(estimate.T @ truth)
+    # Reflections are excluded, because a wave is not its mirror image.
     values[-1] *= np.sign(np.linalg.det(left @ right))
-    squared = np.sum(found**2) + np.sum(truth**2) - 2 * np.sum(values)
-    return float(np.sqrt(max(squared, 0.0) / len(found)))
+    squared = np.sum(estimate**2) + np.sum(truth**2) - 2 * np.sum(values)
+    return float(np.sqrt(max(squared, 0.0) / len(estimate)))
 
 
-def frechet_distance(found: Float[np.ndarray, "poses 3"], truth: Float[np.ndarray, "others 3"]) -> float:
-    """Discrete Frechet distance of two paths, metres: the longest leash two walkers need, who may wait but not turn back.
+def frechet_distance(estimate: Float[np.ndarray, "poses 3"], truth: Float[np.ndarray, "others 3"]) -> float:
+    """Discrete Frechet distance of two paths, metres.
 
-    Unlike the mean distance of waypoints of one number, it does not ask that they be spaced alike.
+    Unlike the mean distance of waypoints, it does not depend on how the waypoints are spaced.
 
     Args:
-        found, truth: places in their order, metres.
+        estimate: translations in their order, (poses, 3), metres.
+        truth: translations in their order, (others, 3), metres.
 
     Source:
         Eiter and Mannila, Computing discrete Frechet distance, 1994.
     """
-    apart = np.linalg.norm(np.asarray(found, float)[:, None] - np.asarray(truth, float)[None], axis=-1)
+    apart = np.linalg.norm(np.asarray(estimate, float)[:, None] - np.asarray(truth, float)[None], axis=-1)
     leash = np.full((len(apart) + 1, apart.shape[1] + 1), np.inf)
     leash[0, 0] = 0.0
     for i, row in enumerate(apart):
@@ -116,20 +119,20 @@ def frechet_distance(found: Float[np.ndarray, "poses 3"], truth: Float[np.ndarra
 
 
 def jerk(path: Float[np.ndarray, "poses 3"]) -> float:
-    """Root mean square of the third differences of places, metres; 0 of a path whose steps change evenly, and of one with fewer than four poses.
+    """Root mean square of the third differences of a path, metres; 0 for a path of fewer than four poses.
 
     Args:
-        path: places at even times, metres.
+        path: translations at even times, (poses, 3), metres.
     """
     third = np.diff(np.asarray(path, float), n=3, axis=0)
     return float(np.sqrt(np.mean(np.sum(third**2, axis=1)))) if len(third) else 0.0
 
 
 def longest_step(path: Float[np.ndarray, "poses 3"]) -> float:
-    """Largest distance of neighbouring places over their mean distance: 1 where they are evenly spaced.
+    """Largest distance of neighbouring waypoints over their mean distance; 1 for an evenly spaced path.
 
     Args:
-        path: places in their order, metres.
+        path: translations in their order, (poses, 3), metres.
     """
     steps = np.linalg.norm(np.diff(np.asarray(path, float), axis=0), axis=1)
     return float(steps.max() / steps.mean()) if steps.any() else 1.0
@@ -141,13 +144,15 @@ def penetration(
     target: Mug | AnnotatedMesh,
     T_world_target: Float[np.ndarray, "4 4"],
 ) -> float | None:
-    """Share of the query points, over all poses, that lie in the object's clay. A query about a handle has some there by right: compare with the truth's.
+    """Share of the query points, over all poses, that lie inside the solid of an object.
+
+    Query points about a handle are partly inside it even on the true path, so compare with the share of that path.
 
     Args:
         trajectory: T_world_query.
-        query: points, metres, query frame.
+        query: query points, (queries, 3), metres, query frame.
         target: the object, in its canonical frame.
-        T_world_target: how that frame lies in the world, 4x4.
+        T_world_target: pose of that frame, 4x4.
 
     Returns:
         A number in [0, 1]; None where the object has no inside.

@@ -1,6 +1,7 @@
-"""Transfer of one pose at a semantic place by a network, and how well it knows the objects' shapes."""
+"""Transfer of one pose at a semantic place: by a network and by baselines, with errors and reconstruction overlaps."""
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -8,22 +9,27 @@ import numpy as np
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
+from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.descriptors import pose_descriptor
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference
-from tdf_jax.evaluation.cases import Case, Transfer
-from tdf_jax.evaluation.metrics import nearest_place, pose_error
+from tdf_jax.evaluation.baselines import METHODS, aligned
+from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, Case, Transfer
+from tdf_jax.evaluation.metrics import FLIP_DEGREES, nearest_place, pose_error
+from tdf_jax.evaluation.statistics import SUCCESS, THRESHOLDS, percentiles, success_rates
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.query import box_query
+from tdf_jax.geometry.symmetry import FOLDS
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.model import Model
+from tdf_jax.networks.occupancy import initialise
 from tdf_jax.networks.refinement import refine
 from tdf_jax.solvers.adam import OptimizeConfig, optimize
 
 OVERLAPS = ("iou", "iou_refined")
-QUERIES = 128
-QUERY_SIZE = 0.06  # metres, of the box around the place: the handle and the wall behind it
+UNTRAINED = "random weights"
+BASELINES = (UNTRAINED, *METHODS)
 
 
 def transferred(
@@ -34,58 +40,77 @@ def transferred(
     config: OptimizeConfig = OptimizeConfig(),
     progress: bool = True,
 ) -> Float[np.ndarray, "cases 7"]:
-    """Transfer the place's pose in every case; of the starts, the one with the least loss counts.
+    """Transfer the pose at the place in every case; of the starts, the one with the lowest loss counts.
 
     Args:
         model: the network.
-        cases: what to transfer.
-        seed: of the query points and the starts.
+        cases: the transfers.
+        seed: seed of the query points and the starts.
         config: settings of the optimiser.
         progress: show a progress bar.
 
     Returns:
-        Poses `wxyz_xyz` of the place, as found on object b, world frame.
+        Estimated poses `wxyz_xyz` of the place on object b, (cases, 7), world frame.
     """
     query_key, start_key = jax.random.split(jax.random.key(seed))
-    found = []
+    estimates = []
     for index, case in enumerate(tqdm(cases, desc="transferring", disable=not progress)):
         reference = place_reference(model, case, box_query(query_key, count=QUERIES, size=QUERY_SIZE * case.scale))
         field = encode(model, case.points_b)
         key = jax.random.fold_in(start_key, index)
         result = optimize(field, reference, key, fix_last=False, energy=EnergyWeights(0.0), config=config)
-        found.append(result.trajectory.wxyz_xyz[0])
-    return np.stack(found)
+        estimates.append(result.trajectory.wxyz_xyz[0])
+    return np.stack(estimates)
 
 
 def place_errors(
-    found: Float[np.ndarray, "cases 7"], cases: Sequence[Transfer]
+    estimates: Float[np.ndarray, "cases 7"], cases: Sequence[Transfer]
 ) -> tuple[Float[np.ndarray, " cases"], Float[np.ndarray, " cases"]]:
-    """Position errors, metres, and rotation errors, degrees, of poses found for cases: from the nearest of a symmetric object's true poses."""
-    T_world_found = np.asarray(Trajectory(jnp.asarray(found)).matrices, float)
+    """Errors of estimated poses, from the nearest of the true poses that the symmetry of an object makes equal.
+
+    Args:
+        estimates: poses `wxyz_xyz`, (cases, 7), metres, world frame.
+        cases: the transfers.
+
+    Returns:
+        Position errors, metres, and rotation errors, degrees, both (cases,).
+    """
+    T_world_estimate = np.asarray(Trajectory(jnp.asarray(estimates)).matrices, float)
     truth = np.stack(
         [
             nearest_place(case.T_world_b, T, case.T_world_place_b, case.fold)
-            for T, case in zip(T_world_found, cases, strict=True)
+            for T, case in zip(T_world_estimate, cases, strict=True)
         ]
     ).astype(np.float32)
-    distance, angle = pose_error(found, se3.pose(truth[:, :3, :3], truth[:, :3, 3]))
+    distance, angle = pose_error(estimates, se3.pose(truth[:, :3, :3], truth[:, :3, 3]))
     return distance, np.degrees(angle)
 
 
-def tilts(found: Float[np.ndarray, "cases 7"], cases: Sequence[Transfer]) -> Float[np.ndarray, " cases"]:
-    """How far poses found for cases are from upright on their object, degrees: the angle between the place's z axis as found and in truth."""
-    up = np.asarray(Trajectory(jnp.asarray(found)).matrices, float)[:, :3, 2]
+def tilts(estimates: Float[np.ndarray, "cases 7"], cases: Sequence[Transfer]) -> Float[np.ndarray, " cases"]:
+    """Angles between the z axis of the place as estimated and as it is, (cases,), degrees.
+
+    Args:
+        estimates: poses `wxyz_xyz`, (cases, 7), metres, world frame.
+        cases: the transfers.
+    """
+    up = np.asarray(Trajectory(jnp.asarray(estimates)).matrices, float)[:, :3, 2]
     true = np.stack([case.T_world_place_b[:3, 2] for case in cases])
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(up, true), axis=1), np.sum(up * true, axis=1)))
 
 
 def place_reference(model: Model, case: Transfer, query: Float[Array, "queries 3"]) -> Reference:
-    """The demonstration of one pose: the query frame at the place on object a."""
+    """The demonstration of one pose: the query frame at the place on object a.
+
+    Args:
+        model: the network.
+        case: the transfer.
+        query: query points, (queries, 3), metres, query frame.
+    """
     field = encode(model, case.points_a)
     place = jnp.asarray(case.T_world_place_a, jnp.float32)
     T_world_query = se3.pose(place[:3, :3], place[:3, 3])
-    shown = Trajectory(T_world_query[None]).shifted(-field.origin)
-    return Reference(_describe(field, T_world_query, query)[None], shown, query)
+    demonstrated = Trajectory(T_world_query[None]).shifted(-field.origin)
+    return Reference(_describe(field, T_world_query, query)[None], demonstrated, query)
 
 
 def overlaps(
@@ -95,13 +120,13 @@ def overlaps(
 
     Args:
         model: the network.
-        cases: whose objects b are reconstructed, in their world poses.
-        samples: points uniform in the bounding box padded by a tenth of the diagonal.
-        seed: of the points.
+        cases: cases whose objects b are reconstructed, in their world poses.
+        samples: number of points, uniform in the bounding box padded by a tenth of the diagonal.
+        seed: seed of the points.
 
     Returns:
-        One number a case as the field was encoded, "iou", and one after `refine`, "iou_refined"; None where object b's
-        mesh is not closed and has no volume.
+        One number for each case as the field was encoded, "iou", and one after `refine`, "iou_refined"; None where the
+        mesh of object b is not closed and has no volume.
     """
     rng = np.random.default_rng(seed)
     ious = no_overlaps([])
@@ -110,27 +135,157 @@ def overlaps(
         pad = 0.1 * case.diagonal
         x = rng.uniform(low - pad, high + pad, (samples, 3))
         true = case.object_b.contains(x)
-        if true is None:
-            measured = dict.fromkeys(OVERLAPS)
-        else:
+        measured: dict[str, float | None] = dict.fromkeys(OVERLAPS)
+        if true is not None:
             world = (x @ case.T_world_b[:3, :3].T + case.T_world_b[:3, 3]).astype(np.float32)
             field = encode(model, case.points_b)
-            measured = {
-                name: _overlap(np.asarray(_occupancy(shape, world)) > 0.5, true)
-                for name, shape in zip(OVERLAPS, (field, refine(model, field, case.points_b)))
-            }
+            for name, shape in zip(OVERLAPS, (field, refine(model, field, case.points_b))):
+                measured[name] = _overlap(np.asarray(_occupancy(shape, world)) > 0.5, true)
         for name, iou in measured.items():
             ious[name].append(iou)
     return ious
 
 
-def no_overlaps(cases: Sequence[Case]) -> dict[str, list[None]]:
-    """What `overlaps` returns of a method that reconstructs nothing."""
+def no_overlaps(cases: Sequence[Case]) -> dict[str, list[float | None]]:
+    """What `overlaps` returns for a method that reconstructs nothing."""
     return {name: [None] * len(cases) for name in OVERLAPS}
 
 
-def _overlap(found, true):
-    return float(np.sum(found & true) / np.sum(found | true))
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """Result of one method on some cases.
+
+    Attributes:
+        method: name of the method.
+        cases: the cases.
+        estimates: poses `wxyz_xyz` of the place, (cases, 7), metres, world frame.
+        distance: position errors, (cases,), metres.
+        angle: rotation errors, (cases,), degrees.
+        ious: reconstruction overlaps, see `overlaps`.
+        summary: statistics of the errors, see `summary`.
+    """
+
+    method: str
+    cases: Sequence[Case]
+    estimates: Float[np.ndarray, "cases 7"]
+    distance: Float[np.ndarray, " cases"]
+    angle: Float[np.ndarray, " cases"]
+    ious: Mapping[str, Sequence[float | None]]
+    summary: dict
+
+
+def compare(
+    cases: Sequence[Case],
+    model: Model,
+    baselines: Sequence[str] = (),
+    *,
+    seed: int = 0,
+    config: OptimizeConfig = OptimizeConfig(),
+    progress: bool = True,
+) -> list[Outcome]:
+    """Run a network and baselines on the same cases, each from as many starts.
+
+    Args:
+        cases: the transfers.
+        model: the network.
+        baselines: names of `BASELINES`; their reconstructions, if any, are not measured.
+        seed: seed of the query points, the starts and the bootstrap.
+        config: settings of the optimiser.
+        progress: show progress bars.
+
+    Raises:
+        InputError: there is no such baseline.
+    """
+    for method in baselines:
+        if method not in BASELINES:
+            raise InputError(f"compare(): baselines has {method!r}; expected some of {', '.join(BASELINES)}")
+    estimates = transferred(model, cases, seed=seed, config=config, progress=progress)
+    outcomes = [_outcome(model.info.name, cases, estimates, overlaps(model, cases), seed)]
+    for method in baselines:
+        if method == UNTRAINED:
+            estimates = transferred(random_weights(model, seed), cases, seed=seed, config=config, progress=progress)
+        else:
+            estimates = aligned(method, cases, seed=seed, num_starts=config.num_starts, progress=progress)
+        outcomes.append(_outcome(method, cases, estimates, no_overlaps(cases), seed))
+    return outcomes
+
+
+def random_weights(model: Model, seed: int) -> Model:
+    """A network of the same sizes with random weights.
+
+    Args:
+        model: the network whose sizes are used.
+        seed: seed of the weights.
+    """
+    return dataclasses.replace(model, params=initialise(jax.random.key(seed), model.config))
+
+
+def summary(
+    distance: Float[np.ndarray, " cases"],
+    angle: Float[np.ndarray, " cases"],
+    ious: Mapping[str, Sequence[float | None]],
+    cases: Sequence[Case],
+    seed: int = 0,
+    tilt: Float[np.ndarray, " cases"] | None = None,
+) -> dict:
+    """Medians, 90th percentiles, success rates with 95 % bootstrap intervals over objects, and flips.
+
+    Args:
+        distance: position errors, (cases,), metres.
+        angle: rotation errors, (cases,), degrees.
+        ious: overlaps by name, each (cases,); None where there is none.
+        cases: the cases that the errors are of.
+        seed: seed of the bootstrap.
+        tilt: errors of the upright axis of the place, (cases,), degrees. They separate objects that stand upright but
+            are rotated about their axis from the other failures.
+
+    Returns:
+        Plain numbers by name; None for an IoU that no case has, and for the intervals of a single object. The key
+        "by_symmetry" holds success rates and IoUs of the objects of each symmetry.
+    """
+    diagonals = distance / [case.diagonal for case in cases]
+    known = {name: [iou for iou in several if iou is not None] for name, several in ious.items()}
+    objects = [case.instance for case in cases]
+    return {
+        "cases": len(cases),
+        "objects": len(set(objects)),
+        **{name: float(np.mean(several)) if several else None for name, several in known.items()},
+        "iou_cases": max(map(len, known.values())),
+        **percentiles("position", 100 * distance, "cm"),
+        **percentiles("position", diagonals, "diagonals"),
+        **percentiles("rotation", angle, "deg"),
+        "flips": int(np.sum(angle > FLIP_DEGREES)),
+        **success_rates(distance, angle, objects, seed),
+        "by_symmetry": _by_symmetry(distance, angle, ious, cases, tilt),
+    }
+
+
+def _by_symmetry(distance, angle, ious, cases, tilt) -> dict:
+    """Success rates and IoUs of the objects of each symmetry, by its name."""
+    folds, parts = np.array([case.fold for case in cases]), {}
+    for fold, name in FOLDS.items():
+        chosen = folds == fold
+        if not chosen.any():
+            continue
+        part = parts[name] = {"cases": int(chosen.sum())}
+        for key, several in ious.items():
+            known = [iou for iou, of_fold in zip(several, chosen) if of_fold and iou is not None]
+            part[key] = float(np.mean(known)) if known else None
+        for key, threshold in THRESHOLDS.items():
+            part[f"success_{key}"] = float(np.mean(threshold.holds(distance[chosen], angle[chosen])))
+        upright = None if tilt is None else float(np.mean(SUCCESS.holds(distance[chosen], tilt[chosen])))
+        part["success_axis_2cm_20deg"] = upright
+    return parts
+
+
+def _outcome(method, cases, estimates, ious, seed) -> Outcome:
+    distance, angle = place_errors(estimates, cases)
+    row = summary(distance, angle, ious, cases, seed, tilts(estimates, cases))
+    return Outcome(method, cases, estimates, distance, angle, ious, row)
+
+
+def _overlap(estimate, truth):
+    return float(np.sum(estimate & truth) / np.sum(estimate | truth))
 
 
 _describe = jax.jit(pose_descriptor)

@@ -1,22 +1,25 @@
-"""Whether objects of a wrong category are noticed: python -m tdf_jax.evaluation.recognition_study --weights mug.
+"""Recognition of objects of another category: how often `CategoryWarning` is right, and how its curve is fitted.
 
-Every case has a demonstration at the usual place of an unseen generated object. A right one is imitated on another
-object of that category, a wrong one on an object of another; the target is seen in turn complete, by one camera, by
-two, and as 300 noisy points.
+Every case has a demonstration at the usual place of an unseen generated object. The target of a right case is another
+object of that category; the target of a wrong case is of another category. The clouds of the targets are in turn
+complete, seen by one camera, seen by two, and 300 noisy points.
+
+    python -m tdf_jax.evaluation.recognition_study --weights mug --seed 15
 """
 
 import argparse
 import json
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
 import numpy as np
+from jaxtyping import Float, Int
 
 from tdf_jax._internal.errors import CategoryWarning
-from tdf_jax.evaluation.cases import generated_case
-from tdf_jax.evaluation.pick_transfer import QUERIES, QUERY_SIZE
-from tdf_jax.evaluation.scene import place_demonstration
+from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, generated_case, place_demonstration
+from tdf_jax.evaluation.records import header, write_record
 from tdf_jax.geometry.query import box_query
 from tdf_jax.imitation import imitate
 from tdf_jax.networks.checkpoint import load_model
@@ -26,23 +29,42 @@ from tdf_jax.shapes import FAMILIES
 from tdf_jax.uncertainty.calibration import CURVES, logistic, ranking, recognition, surface_logit
 
 CLOUDS = ("full", "views1", "views2", "noise")
-THRESHOLDS = (0.05, 0.25, 0.5, 0.75, 0.95)
+LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)  # probabilities below which an object counts as of another category
 
 
 def evidence(model: Model, category: str, seed: int, index: int, right: bool) -> tuple[float, float]:
-    """Residual and surface logit of one case."""
+    """Residual and surface logit of one case.
+
+    Args:
+        model: the network.
+        category: category of the demonstration.
+        seed, index: number of the case.
+        right: whether the target is of that category.
+    """
     clouds, others = CLOUDS[index % len(CLOUDS)], [name for name in FAMILIES if name != category]
-    shown = generated_case(category, seed, index, clouds=clouds)
-    target = shown if right else generated_case(others[index // len(CLOUDS) % len(others)], seed, index, clouds=clouds)
-    demonstration = place_demonstration(shown, "line", 2, box_query(jax.random.key(seed), QUERIES, QUERY_SIZE))
+    case = generated_case(category, seed, index, clouds=clouds)
+    target = case if right else generated_case(others[index // len(CLOUDS) % len(others)], seed, index, clouds=clouds)
+    demonstration = place_demonstration(case, "line", 2, box_query(jax.random.key(seed), QUERIES, QUERY_SIZE))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CategoryWarning)
         result = imitate(model, demonstration, target.points_b, key=jax.random.key(index), fix_last=False)
-    return result.residual, surface_logit(encode(model, target.points_b), target.points_b)
+    return float(result.residual), surface_logit(encode(model, target.points_b), target.points_b)
 
 
-def collected(model: Model, category: str, seed: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Evidence (2 count, 2), whether the object was of the category, and the number of its cloud in `CLOUDS`, both (2 count,)."""
+def collected(
+    model: Model, category: str, seed: int, count: int
+) -> tuple[Float[np.ndarray, "cases 2"], Float[np.ndarray, " cases"], Int[np.ndarray, " cases"]]:
+    """Evidence of right and wrong cases of a category.
+
+    Args:
+        model: the network.
+        category: category of the demonstrations.
+        seed: seed of the cases.
+        count: number of right cases, and of wrong ones.
+
+    Returns:
+        Residuals and surface logits, (cases, 2); 1 for right cases, (cases,); numbers of their clouds in `CLOUDS`.
+    """
     rows, right = [], []
     for index in range(count):
         for is_right in (True, False):
@@ -53,53 +75,77 @@ def collected(model: Model, category: str, seed: int, count: int) -> tuple[np.nd
     return np.array(rows), np.array(right), np.arange(len(right)) // 2 % len(CLOUDS)
 
 
-def features(rows: np.ndarray) -> np.ndarray:
+def features(rows: Float[np.ndarray, "cases 2"]) -> Float[np.ndarray, "cases 2"]:
+    """Features of the logistic curve: -log(residual) and the surface logit."""
     return np.column_stack([-np.log(rows[:, 0]), rows[:, 1]])
 
 
-def report(rows: np.ndarray, right: np.ndarray, seen: np.ndarray, curve) -> dict:
-    """The area under the ROC and points of it, of the curve and of the residual alone."""
-    predicted = np.array([recognition(*row, tuple(curve)) for row in rows])
-    points = {
-        str(one): {
-            "wrong_noticed": float(np.mean(predicted[right == 0] < one)),
-            "right_doubted": float(np.mean(predicted[right == 1] < one)),
+def summary(
+    rows: Float[np.ndarray, "cases 2"],
+    right: Float[np.ndarray, " cases"],
+    clouds: Int[np.ndarray, " cases"],
+    curve: Sequence[float],
+) -> dict:
+    """The area under the ROC of a curve and of the residual alone, and rates at all `LEVELS`.
+
+    Args:
+        rows: residuals and surface logits, (cases, 2).
+        right: 1 for right cases, (cases,).
+        clouds: numbers of their clouds in `CLOUDS`, (cases,).
+        curve: intercept and both slopes.
+    """
+    intercept, *slopes = map(float, curve)
+    predicted = np.array([recognition(*row, (intercept, slopes[0], slopes[1])) for row in rows])
+    rates = {
+        str(level): {
+            "wrong_noticed": float(np.mean(predicted[right == 0] < level)),
+            "right_doubted": float(np.mean(predicted[right == 1] < level)),
         }
-        for one in THRESHOLDS
+        for level in LEVELS
     }
     areas = {"area": ranking(predicted, right), "area_of_the_residual_alone": ranking(-rows[:, 0], right)}
-    by_cloud = {name: ranking(predicted[seen == kind], right[seen == kind]) for kind, name in enumerate(CLOUDS)}
-    return {"cases": len(right), **areas, "area_by_cloud": by_cloud, "thresholds": points}
+    by_cloud = {name: ranking(predicted[clouds == kind], right[clouds == kind]) for kind, name in enumerate(CLOUDS)}
+    return {"cases": len(right), **areas, "area_by_cloud": by_cloud, "thresholds": rates}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--weights", default="mug")
-    parser.add_argument("--category", choices=list(FAMILIES), nargs="+", default=["mug"])
-    parser.add_argument("--seed", type=int, default=0)
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Collect evidence, evaluate or fit the curve, and print the record.
+
+    Args:
+        arguments: words of the command line; by default those of the process.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m tdf_jax.evaluation.recognition_study",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--weights", default="mug", help="a name of shipped weights, or a .safetensors file")
+    parser.add_argument(
+        "--category", choices=list(FAMILIES), nargs="+", default=["mug"], help="categories of the demonstrations"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of the cases")
     parser.add_argument("--count", type=int, default=100, help="right cases, and as many wrong ones, of each category")
     parser.add_argument(
-        "--fit", action="store_true", help="fit the curve to these cases, instead of trying that of the weights"
+        "--fit", action="store_true", help="fit the curve to these cases, instead of evaluating that of the weights"
     )
-    parser.add_argument("--out", type=Path, help="JSON file")
-    settings = parser.parse_args()
-    if settings.count < 1:
-        parser.error(f"--count is {settings.count}; expected at least 1")
-    model = load_model(settings.weights)
-    if not settings.fit and model.info.name not in CURVES:
+    parser.add_argument("--out", type=Path, help="JSON file for the record")
+    options = parser.parse_args(arguments)
+    if options.count < 1:
+        parser.error(f"--count is {options.count}; expected at least 1")
+    model = load_model(options.weights)
+    if not options.fit and model.info.name not in CURVES:
         parser.error(
-            f"--weights is {settings.weights}, which has no curve; expected one of {', '.join(CURVES)}, or --fit"
+            f"--weights is {options.weights}, which has no curve; expected one of {', '.join(CURVES)}, or --fit"
         )
-    parts = [collected(model, category, settings.seed, settings.count) for category in settings.category]
-    rows, right, seen = (np.concatenate(column) for column in zip(*parts))
-    curve = logistic(features(rows), right) if settings.fit else CURVES[model.info.name]
-    found = {"weights": model.info.name, "seed": settings.seed, "curve": [float(x) for x in curve]} | report(
-        rows, right, seen, curve
-    )
-    found["categories"] = {category: report(*part, curve) for category, part in zip(settings.category, parts)}
-    print(json.dumps(found, indent=1))
-    if settings.out is not None:
-        settings.out.write_text(json.dumps(found, indent=1) + "\n")
+    parts = [collected(model, category, options.seed, options.count) for category in options.category]
+    rows, right, clouds = (np.concatenate(column) for column in zip(*parts))
+    curve = logistic(features(rows), right) if options.fit else CURVES[model.info.name]
+    settings = {name: value for name, value in vars(options).items() if name != "out"}
+    record = header(settings, model) | {"curve": [float(x) for x in curve]} | summary(rows, right, clouds, curve)
+    record["categories"] = {category: summary(*part, curve) for category, part in zip(options.category, parts)}
+    print(json.dumps(record, indent=1))
+    if options.out is not None:
+        write_record("recognition_study", options.out, record)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A demonstration and the object to imitate it on, in one world frame."""
+"""A demonstration and the target object of its imitation, in one world frame."""
 
 import dataclasses
 from typing import TYPE_CHECKING
@@ -6,31 +6,26 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Array, Float
 
-from tdf_jax.evaluation.cases import Case
 from tdf_jax.evaluation.metrics import expected_trajectory, nearest_place
 from tdf_jax.geometry.demonstration import Demonstration
-from tdf_jax.geometry.paths import PATHS, SHAPES
 from tdf_jax.geometry.trajectory import Trajectory
 
 if TYPE_CHECKING:
     import trimesh
 
-PLACE = (0.0, 0.24, 0.18)  # metres from the pick: 0.30 m away, to the side and up
-LIFT = (0.0, 0.0, 1.0)  # a semicircle and a wave leave the straight line upwards first
-
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """A demonstration, and the object to imitate it on.
+    """A demonstration, and the target object of its imitation.
 
     Attributes:
-        demonstration: as given or generated.
-        points: the target's cloud, (points, 3), metres, world frame.
-        T_world_target: how the file's frame, or the generated object's, lies in the world, 4x4.
+        demonstration: the demonstration, from a file or generated.
+        points: cloud of the target, (points, 3), metres, world frame.
+        T_world_target: pose of the frame of the target's file, or of the generated object, 4x4.
         T_world_places: frames of the picked place, such as a mug's handle, on both objects, 4x4; None unless both are
             generated.
-        meshes: of both objects, world frame, where they have one.
-        fold: symmetry of a generated target about the z axis of its frame, see `tdf_jax.symmetry`.
+        meshes: meshes of both objects, metres, world frame; None where there is none.
+        fold: symmetry of a generated target about the z axis of its frame, see `tdf_jax.geometry.symmetry`.
     """
 
     demonstration: Demonstration
@@ -44,29 +39,16 @@ class Scene:
         """The true trajectory on the target for a goal; None where it is not known.
 
         Args:
-            goal: last pose, T_world_query.
-            pick: first pose that was found: of a symmetric target's true picks, the one nearest to it begins the
-                trajectory.
+            goal: last pose, T_world_query, `wxyz_xyz`.
+            pick: estimated first pose, `wxyz_xyz`. A symmetric target has several true picks, and the trajectory begins
+                at the one nearest to the estimate.
         """
         if self.T_world_places is None:
             return None
-        shown, (place_a, place_b) = self.demonstration.trajectory, self.T_world_places
+        demonstrated, (place_a, place_b) = self.demonstration.trajectory, self.T_world_places
         if pick is not None:
-            found = Trajectory(np.asarray(pick)[None]).matrices[0] @ np.linalg.inv(shown.matrices[0]) @ place_a
-            place_b = nearest_place(self.T_world_target, found, place_b, self.fold)
-        return expected_trajectory(shown, place_a, place_b, goal)
-
-
-def place_demonstration(case: Case, path: str, poses: int, query: Float[Array, "queries 3"]) -> Demonstration:
-    """A trajectory shown on a case's first object, from its place (a mug's handle) to `PLACE` away from there.
-
-    Args:
-        case: with the object and the place on it.
-        path: one of `tdf_jax.geometry.paths.PATHS`.
-        poses: of the trajectory.
-        query: points in the query frame, metres.
-    """
-    pick = case.T_world_place_a
-    start, bow = pick[:3, 3], {"bulge": LIFT} if path in SHAPES and path != "line" else {}
-    trajectory = PATHS[path](poses, start, start + np.multiply(PLACE, case.scale), rotation=pick[:3, :3], **bow)
-    return Demonstration(case.points_a, trajectory, query)
+            estimate = (
+                Trajectory(np.asarray(pick)[None]).matrices[0] @ np.linalg.inv(demonstrated.matrices[0]) @ place_a
+            )
+            place_b = nearest_place(self.T_world_target, estimate, place_b, self.fold)
+        return expected_trajectory(demonstrated, place_a, place_b, goal)

@@ -1,4 +1,4 @@
-"""One imitation of the paper: run, and measured against the truth."""
+"""One imitation of the paper, and its errors."""
 
 import dataclasses
 
@@ -17,43 +17,44 @@ from tdf_jax.paper import setting as settings
 from tdf_jax.paper.setting import Setting
 from tdf_jax.solvers.adam import optimize
 
-SETTLED = 0.95  # of the loss's drop
-DENSE = 61  # poses of the true path that paths are measured against, whatever their number of poses
+SETTLED = 0.95  # share of the drop of the loss
+DENSE = 61  # poses of the true path that a path of any number of poses is compared with
 FLIPPED = np.radians(FLIP_DEGREES)
 
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """What became of one setting; poses are `wxyz_xyz`, T_world_query.
+    """Result of one setting; poses are `wxyz_xyz`, T_world_query.
 
     Attributes:
-        reference: the demonstration.
-        expected: the true trajectory on the test mug.
-        path: places of the true trajectory of `DENSE` poses.
-        starts, found: of every start, before and after.
-        losses: energy of every start before each iteration, and after the last.
-        descriptor: l_t alone, of the best start's trajectory and of the true one.
-        expected_energy: energy of the true trajectory.
+        reference: the demonstration, (poses, 7).
+        expected: ground truth on the test mug, (poses, 7).
+        path: translations of the ground truth with `DENSE` poses, (dense, 3), metres, world frame.
+        initial_trajectories: initial trajectory of every start, (inits, poses, 7).
+        trajectories: final trajectory of every start, (inits, poses, 7).
+        losses: energy of every start before each iteration and after the last, (inits, iterations + 1).
+        descriptor: l_t alone, of the best start's trajectory and of the ground truth, (2,).
+        expected_energy: energy of the ground truth.
     """
 
     reference: Float[np.ndarray, "poses 7"]
     expected: Float[np.ndarray, "poses 7"]
     path: Float[np.ndarray, "dense 3"]
-    starts: Float[np.ndarray, "inits poses 7"]
-    found: Float[np.ndarray, "inits poses 7"]
+    initial_trajectories: Float[np.ndarray, "inits poses 7"]
+    trajectories: Float[np.ndarray, "inits poses 7"]
     losses: Float[np.ndarray, "inits iterations_and_1"]
     descriptor: Float[np.ndarray, "2"]
     expected_energy: Float[np.ndarray, ""]
 
     @property
     def best(self) -> int:
-        """The start with the least energy at the end."""
+        """The start with the lowest energy at the end."""
         return int(np.nanargmin(self.losses[:, -1]))
 
     @property
     def trajectory(self) -> Float[np.ndarray, "poses 7"]:
-        """What the best start came to."""
-        return self.found[self.best]
+        """The final trajectory of the best start."""
+        return self.trajectories[self.best]
 
     @property
     def loss(self) -> float:
@@ -67,7 +68,7 @@ class Run:
 
     @property
     def settled(self) -> int:
-        """Iterations after which the best start's loss has made `SETTLED` of its drop, for good."""
+        """Number of iterations after which the loss of the best start has fallen by `SETTLED` of its total drop, for good."""
         curve = self.losses[self.best]
         limit = curve[0] - SETTLED * (curve[0] - curve[-1])
         above = np.flatnonzero(curve > limit)
@@ -75,23 +76,26 @@ class Run:
 
     @property
     def pick_error(self) -> tuple[float, float]:
-        """Distance, metres, and angle, radians, of the first pose from the true one."""
+        """Position error, metres, and rotation error, radians, of the first pose."""
         distance, angle = pose_error(self.trajectory[0], self.expected[0])
         return float(distance), float(angle)
 
     @property
     def flipped(self) -> bool:
-        """Whether the pick is turned by more than `FLIP_DEGREES`."""
+        """Whether the rotation error of the pick is above `FLIP_DEGREES`."""
         return self.pick_error[1] > FLIPPED
 
     @property
     def path_error(self) -> float:
-        """Mean distance, metres, of the true path, densely sampled, from the polyline through the found poses: few poses cut corners."""
+        """Mean distance of the dense true path from the polyline through the estimated poses, metres.
+
+        A path of few poses cuts corners, which this error includes.
+        """
         return float(np.mean(distance_from_polyline(self.path, self.trajectory[:, 4:])))
 
     @property
     def waypoint_error(self) -> tuple[float, float]:
-        """Mean distance, metres, and angle, radians, of the poses from the true ones; a fixed last pose counts, with no error."""
+        """Mean position error, metres, and rotation error, radians, of all poses, a fixed last pose included."""
         distance, angle = pose_error(self.trajectory, self.expected)
         return float(distance.mean()), float(angle.mean())
 
@@ -111,7 +115,7 @@ def imitation(model: Model, setting: Setting) -> Run:
 
     Args:
         model: the network.
-        setting: all of its numbers.
+        setting: the setting.
     """
     scene = settings.scene(setting)
     reference = describe(model, scene.demonstration)
@@ -123,17 +127,17 @@ def imitation(model: Model, setting: Setting) -> Run:
         field, reference, key, goal=goal, fix_last=setting.fix_last, energy=setting.energy, config=setting.optimiser
     )
     expected = scene.expected(goal)
-    dense = settings.scene(dataclasses.replace(setting, poses=DENSE)).expected(goal)
-    found = result.trajectory
+    dense = settings.scene(dataclasses.replace(setting, num_poses=DENSE)).expected(goal)
+    estimate = result.trajectory
     weights = jax.tree.map(lambda weight: jnp.asarray(weight, jnp.float32), setting.energy)
     return Run(
         reference=np.asarray(scene.demonstration.trajectory.wxyz_xyz),
         expected=np.asarray(expected.wxyz_xyz),
         path=np.asarray(dense.translations),
-        starts=np.asarray(result.starts),
-        found=np.asarray(result.trajectories),
-        losses=np.column_stack([result.losses, result.energies]),
-        descriptor=np.array([_descriptor_loss(one, field, reference) for one in (found, expected)]),
+        initial_trajectories=np.asarray(result.initial_trajectories),
+        trajectories=np.asarray(result.trajectories),
+        losses=np.column_stack([result.candidate_history, result.energies]),
+        descriptor=np.array([_descriptor_loss(one, field, reference) for one in (estimate, expected)]),
         expected_energy=np.asarray(_energy(expected, field, reference, weights)),
     )
 

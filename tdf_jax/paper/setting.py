@@ -1,4 +1,4 @@
-"""One imitation of the paper as numbers: what the paper says, and a name for every choice it leaves open."""
+"""The numbers of one imitation of the paper: those that the paper gives, and those that it leaves open."""
 
 import dataclasses
 import functools
@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from tdf_jax._internal.deprecation import renamed_fields
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import COMPENSATOR_ORDERS, POSE_NORMS, EnergyWeights
 from tdf_jax.energy.reference import Reference
@@ -26,60 +27,62 @@ from tdf_jax.solvers.initial import STARTS, default_goal
 QUERIES = ("box", "gaussian")
 CORRELATED = ("demonstration", "stretched")
 FIELD_ENERGIES = ("least", "mean")
-SEEDS = 2**32  # jax takes no larger one
+SEEDS = 2**32  # jax takes no larger seed
 END = (0.0, 0.83, 0.0)  # from the first pose to the last, in the paper's unit: figure 2 marks (0, 0) and (0, 0.83)
-POINTS = 1500  # of a cloud, before `describe` and `imitate` thin it
-STREAM = 0x7AB1E1  # of the setting's draws
+POINTS = 1500  # of a cloud, before `describe` and `imitate` subsample it
+STREAM = 0x7AB1E1  # folded into all random draws of a setting
 
 
+@renamed_fields(poses="num_poses", inits="num_starts", lever="rotation_scale")
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """One imitation. The paper gives trajectory, displacement, k, iterations and distance; the rest is read from its figures or left open, and
-    docs/results/paper.md says why it is as it is.
+    """One imitation of the paper.
+
+    The paper gives trajectory, displacement, k, iterations and distance. The other numbers are read from its figures or
+    left open; docs/results/paper.md gives the reasons for them.
 
     Attributes:
-        trajectory: the demonstration's shape, from the handle to a place 0.83 units along y; it bows to +x, the
-            handle's side.
-        displacement: world vector, in the paper's unit.
-        displaced: what it moves: the endpoint ("goal", table 1), or the test mug and so the starting point ("start",
-            section 3.1).
+        trajectory: shape of the demonstration, from the handle to a goal 0.83 units along y; it bows to +x, the side of
+            the handle.
+        displacement: displacement vector, in the paper's unit, world frame.
+        displaced: what the displacement moves: the endpoint ("goal", table 1), or the test mug and therefore the
+            starting point ("start", section 3.1).
         k: weight of the correlation term, per unit.
-        poses: of the trajectory, n.
-        iterations: optimisation steps; the paper's epochs.
-        distance: of the first pose from the cloud's centre, on the handle's side, in the paper's unit (figure 3); by
-            default it is at the handle.
-        correlated: what the correlation term pulls towards: the demonstration, or the demonstration stretched to the
-            displaced goal, waypoint i of n moved by i / (n - 1) of the displacement.
+        num_poses: number of poses of the trajectory, n.
+        iterations: number of optimisation steps; the paper's epochs.
+        distance: distance of the first pose from the centroid of the cloud, on the side of the handle, in the paper's
+            unit (figure 3); by default the first pose is at the handle.
+        correlated: what the correlation term compares with: the demonstration, or the demonstration stretched to the
+            displaced goal, which moves waypoint i of n by i / (n - 1) of the displacement.
         pose_norm: norm of the correlation term, see docs/guide/energy.md.
-        lever: metres that a turn of one unit counts as in the correlation term.
-        compensator: weight of eq. 6, steps in metres and turns as they are.
+        rotation_scale: metres per radian of a rotation in the correlation term.
+        compensator: weight of eq. 6.
         compensator_order: eq. 6 summed over steps ("frobenius"), or its largest step ("infinity").
         fix_last: whether the last pose stays at the goal or only starts there.
-        query: query points uniform in a cube ("box"), or normal about its middle as in NDF's demonstrations
-            ("gaussian").
+        query: query points uniform in a cube ("box"), or normally distributed as in NDF's demonstrations ("gaussian").
         query_size: edge of the cube, or standard deviation, metres; by default 0.1 and 0.025.
         queries: number of query points.
-        start: poses random one by one ("scattered"), or the whole demonstration turned at random ("carried").
-        translation_rate: Adam's first step size for translations, metres; a pose travels at most half of `iterations`
-            times as far. The 0.01 m of `tdf_jax.OptimizeConfig` are for a path of 0.3 m.
-        inits: random starts; the one with the least energy counts.
-        diagonal: of both mugs, metres.
-        unit: metres the paper's unit is.
-        turn: of the test mug, degrees, about a random axis; "any" is a uniform rotation.
-        field_energy: E(x) of figure 2: the least of the waypoints' energies at x, or their mean.
-        seed: which mugs, axis, clouds, query points and starts.
+        start: every pose random ("scattered"), or the whole demonstration rotated at random ("carried").
+        translation_rate: first step size of Adam for translations, metres. A pose can move by at most half of
+            `iterations` steps; the default of `tdf_jax.OptimizeConfig` is for a path of 0.3 m.
+        num_starts: number of random starts; the one with the lowest energy counts.
+        diagonal: diagonal of both mugs, metres.
+        unit: the paper's unit, metres.
+        turn: rotation of the test mug about a random axis, degrees; "any" is a uniform rotation.
+        field_energy: E(x) of figure 2: the lowest of the energies of the waypoints at x, or their mean.
+        seed: seed of the mugs, the axis, the clouds, the query points and the starts.
     """
 
     trajectory: Literal["line", "semicircle", "wave"] = "wave"
     displacement: tuple[float, float, float] = (0.0, 0.0, 0.0)
     displaced: Literal["goal", "start"] = "goal"
     k: float = 0.02
-    poses: int = 7
+    num_poses: int = 7
     iterations: int = 100
     distance: float | None = None
     correlated: Literal["demonstration", "stretched"] = "demonstration"
     pose_norm: Literal["frobenius", "metres_radians", "mean_absolute"] = "frobenius"
-    lever: float = 0.05
+    rotation_scale: float = 0.05
     compensator: float = 0.0
     compensator_order: Literal["frobenius", "infinity"] = "frobenius"
     fix_last: bool = True
@@ -88,7 +91,7 @@ class Setting:
     queries: int = 128
     start: Literal["carried", "scattered"] = "scattered"
     translation_rate: float = 0.03
-    inits: int = 4
+    num_starts: int = 4
     diagonal: float = 0.3
     unit: float = 1.0
     turn: float | Literal["any"] = 60.0
@@ -102,7 +105,7 @@ class Setting:
         for name, known in choices.items():
             if getattr(self, name) not in known:
                 raise InputError(f"Setting(): {name} is {getattr(self, name)!r}; expected one of {', '.join(known)}")
-        for name, least in {"poses": 2, "iterations": 1, "queries": 1, "inits": 1, "seed": 0}.items():
+        for name, least in {"num_poses": 2, "iterations": 1, "queries": 1, "num_starts": 1, "seed": 0}.items():
             if getattr(self, name) < least:
                 raise InputError(f"Setting(): {name} is {getattr(self, name)}; expected at least {least}")
         if self.seed >= SEEDS:
@@ -111,7 +114,7 @@ class Setting:
             value = getattr(self, name)
             if value is not None and not 0 < value < np.inf:
                 raise InputError(f"Setting(): {name} is {value}; expected a positive number")
-        for name in ("k", "lever", "compensator"):
+        for name in ("k", "rotation_scale", "compensator"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise InputError(f"Setting(): {name} is {getattr(self, name)}; expected a number of 0 or more")
         if self.turn != "any" and not 0 <= self.turn <= 180:
@@ -121,14 +124,16 @@ class Setting:
 
     @property
     def energy(self) -> EnergyWeights:
-        """The energy's weights; k per unit becomes k per metre."""
-        return EnergyWeights(self.k / self.unit, self.compensator, self.lever, self.pose_norm, self.compensator_order)
+        """Weights of the energy; k per unit becomes k per metre."""
+        return EnergyWeights(
+            self.k / self.unit, self.compensator, self.rotation_scale, self.pose_norm, self.compensator_order
+        )
 
     @property
     def optimiser(self) -> OptimizeConfig:
         """Settings of the optimiser; scattered starts fill a ball of one diagonal."""
         return OptimizeConfig(
-            inits=self.inits,
+            num_starts=self.num_starts,
             iterations=self.iterations,
             translation_rate=self.translation_rate,
             start=self.start,
@@ -142,7 +147,7 @@ class Setting:
 
 
 def mug(setting: Setting, which: int) -> Mug:
-    """The reference's mug (0) or the test's (1) of a seed, unseen in training, at the setting's size."""
+    """The reference mug (0) or the test mug (1), unseen in training, at the size of the setting."""
     return _mug(setting.seed, which, setting.diagonal)
 
 
@@ -164,19 +169,19 @@ def rotation(setting: Setting) -> Float[np.ndarray, "3 3"]:
 
 
 def demonstrated(setting: Setting, handle: Float[np.ndarray, "4 4"], centre: Float[np.ndarray, "3"]) -> Trajectory:
-    """The demonstration: a shape from the handle, or from a distance on its side, with the query frame's axes the handle's.
+    """The demonstration, from the handle or from a distance on its side; the query frame has the axes of the handle.
 
     Args:
         setting: the shape, its number of poses and its distance.
-        handle: T_world_handle.
-        centre: of the cloud, metres.
+        handle: T_world_handle, 4x4.
+        centre: centroid of the cloud, (3,), metres, world frame.
     """
     start = handle[:3, 3]
     if setting.distance is not None:
         outward = start - centre
         start = centre + setting.distance * setting.unit * outward / np.linalg.norm(outward)
     end = start + setting.unit * np.array(END)
-    return SHAPES[setting.trajectory](setting.poses, start, end, rotation=handle[:3, :3])
+    return SHAPES[setting.trajectory](setting.num_poses, start, end, rotation=handle[:3, :3])
 
 
 def query(setting: Setting) -> Float[Array, "queries 3"]:
@@ -188,7 +193,7 @@ def query(setting: Setting) -> Float[Array, "queries 3"]:
 
 
 def scene(setting: Setting) -> Scene:
-    """The demonstration, and the test mug as it lies in the world."""
+    """The demonstration, and the test mug in its pose in the world."""
     a, b = (mug(setting, which) for which in range(2))
     points_a, points_b = (
         sample_surface(one.mesh, POINTS, np.random.default_rng([STREAM, setting.seed, 1 + which])).astype(np.float32)
@@ -209,18 +214,21 @@ def scene(setting: Setting) -> Scene:
 
 
 def aim(setting: Setting, reference: Reference) -> Reference:
-    """The reference with what the correlation term pulls towards, see `Setting.correlated`."""
+    """The reference with the trajectory that the correlation term compares with, see `Setting.correlated`."""
     if setting.correlated == "demonstration":
         return reference
     offset = setting.offset if setting.displaced == "goal" else -setting.offset
-    s = np.linspace(0, 1, setting.poses)[:, None]
+    s = np.linspace(0, 1, setting.num_poses)[:, None]
     wxyz_xyz = reference.trajectory.wxyz_xyz
     stretched = Trajectory(wxyz_xyz.at[:, 4:].add(np.asarray(s * offset, wxyz_xyz.dtype)))
     return dataclasses.replace(reference, trajectory=stretched)
 
 
 def goal(setting: Setting, field: DescriptorField, reference: Reference) -> Float[Array, "7"]:
-    """The last pose: the demonstration's carried by the centroids and displaced, or, where the mug was displaced, where it was."""
+    """The last pose: the last pose of the demonstration, moved with the centroid and then displaced.
+
+    Where the mug is displaced instead, the goal stays where it was without the displacement.
+    """
     offset = setting.offset if setting.displaced == "goal" else -setting.offset
     carried = default_goal(field, reference)
     return carried.at[4:].add(np.asarray(offset, carried.dtype))

@@ -1,4 +1,4 @@
-"""Table 1: the paper's nine rows, and what changes them."""
+"""Table 1: the nine rows of the paper, and variations of its settings."""
 
 import csv
 import dataclasses
@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from tdf_jax.evaluation.tables import markdown
 from tdf_jax.paper.runs import Run
 from tdf_jax.paper.setting import Setting
 
@@ -24,11 +25,12 @@ PAPER = {
 }
 SWEPT = (("line", (0.0, 0.0, 0.0)), ("semicircle", (0.0, 0.1, 0.0)), ("wave", (-0.2, 0.1, 0.3)))
 SEEDS = 5
-COMPENSATOR = 0.02  # weight of eq. 6; the paper gives none, this is that of the term it took instead
+COMPENSATOR = 0.02  # weight of eq. 6; the paper gives none, so it is the weight of the correlation term
 
-TABLE = "table 1"  # group of the paper's rows
+TABLE = "table 1"  # group of the rows of the paper
 UNCHANGED = "nothing"
-# What is changed, in words, and how; the paper's own questions first, then the choices it leaves open.
+# Words for a variation, and the fields that it changes: first the paper's own questions, then the choices that it
+# leaves open.
 VARIATIONS: dict[str, dict] = {
     UNCHANGED: {},
     "k = 0": {"k": 0.0},
@@ -36,24 +38,24 @@ VARIATIONS: dict[str, dict] = {
     "k = 0.2": {"k": 0.2},
     "l_p for l_c, Frobenius": {"k": 0.0, "compensator": COMPENSATOR},
     "l_p for l_c, infinity": {"k": 0.0, "compensator": COMPENSATOR, "compensator_order": "infinity"},
-    "n = 3": {"poses": 3},
-    "n = 5": {"poses": 5},
-    "n = 13": {"poses": 13},
-    "n = 25": {"poses": 25},
+    "n = 3": {"num_poses": 3},
+    "n = 5": {"num_poses": 5},
+    "n = 13": {"num_poses": 13},
+    "n = 25": {"num_poses": 25},
     "last pose free": {"fix_last": False},
     "start displaced by (-0.2, 0, 0)": {"displacement": (-0.2, 0.0, 0.0), "displaced": "start"},
     "start displaced by (-0.2, 0.1, 0.3)": {"displacement": (-0.2, 0.1, 0.3), "displaced": "start"},
     "l_c towards the demonstration stretched to the goal": {"correlated": "stretched"},
-    "pose norm: lever 0.02 m": {"lever": 0.02},
-    "pose norm: lever 1 m, the plain norm": {"lever": 1.0},
+    "pose norm: rotation scale 0.02 m": {"rotation_scale": 0.02},
+    "pose norm: rotation scale 1 m, the plain norm": {"rotation_scale": 1.0},
     "pose norm: metres and radians": {"pose_norm": "metres_radians"},
-    "pose norm: mean absolute": {"pose_norm": "mean_absolute", "lever": 1.0},
+    "pose norm: mean absolute": {"pose_norm": "mean_absolute", "rotation_scale": 1.0},
     "query: Gaussian, sigma 2.5 cm": {"query": "gaussian"},
     "query: box of 5 cm": {"query_size": 0.05},
     "query: box of 20 cm": {"query_size": 0.2},
     "start: the whole path turned": {"start": "carried"},
     "translation rate 0.01 m": {"translation_rate": 0.01},
-    "10 starts": {"inits": 10},
+    "10 starts": {"num_starts": 10},
     "objects of 0.2 m": {"diagonal": 0.2},
     "objects of one unit (0.3 m)": {"unit": 0.3},
     "test mug as the reference lies": {"turn": 0.0},
@@ -91,9 +93,9 @@ class Row:
     """Means over the seeds of one row.
 
     Attributes:
-        group: what was changed, in words; `TABLE` for the paper's rows.
-        setting: of the first seed.
-        runs: one a seed.
+        group: the variation, a key of `VARIATIONS`; `TABLE` for the rows of the paper.
+        setting: setting of the first seed.
+        runs: one run for each seed.
     """
 
     group: str
@@ -102,7 +104,7 @@ class Row:
 
     @property
     def paper_loss(self) -> float | None:
-        """The paper's final loss; None where it has no such row."""
+        """Final loss in the paper; None where the paper has no such row."""
         setting = self.setting
         return (
             PAPER.get((setting.trajectory, setting.displacement))
@@ -111,15 +113,15 @@ class Row:
         )
 
     def mean(self, value: Callable[[Run], float]) -> float:
-        """Mean over the seeds of a run's property."""
+        """Mean of a property of the runs over the seeds."""
         return float(np.mean([value(run) for run in self.runs]))
 
     def spread(self, value: Callable[[Run], float]) -> float | None:
-        """Standard deviation over the seeds; None for one seed."""
+        """Standard deviation of a property of the runs over the seeds; None for one seed."""
         return float(np.std([value(run) for run in self.runs], ddof=1)) if len(self.runs) > 1 else None
 
     def numbers(self) -> dict:
-        """The row by `COLUMNS`."""
+        """The values of all `COLUMNS`."""
         return {
             "group": self.group,
             "trajectory": self.setting.trajectory,
@@ -148,12 +150,12 @@ class Row:
 def planned(
     base: Setting, seeds: int = SEEDS, variations: Sequence[str] = tuple(VARIATIONS)
 ) -> list[tuple[str, list[Setting]]]:
-    """What `rows` runs: (group, settings), one setting a seed.
+    """The settings of all rows: (group, settings), one setting for each seed.
 
     Args:
         base: all other numbers.
-        seeds: of the paper's rows, from `base.seed` on; variations have one.
-        variations: which of `VARIATIONS`.
+        seeds: number of seeds of the rows of the paper, from `base.seed` on; variations have one seed.
+        variations: keys of `VARIATIONS`.
     """
     plan = []
     for trajectory, displacement in PAPER:
@@ -170,14 +172,14 @@ def rows(run: Callable[[Setting], Run], plan: list[tuple[str, list[Setting]]]) -
     """Table 1 and its variations.
 
     Args:
-        run: gives a setting's run, such as `tdf_jax.paper.store.Store.run`.
-        plan: from `planned`.
+        run: makes the run of a setting, such as `tdf_jax.paper.store.Store.run`.
+        plan: plan as `planned` makes it.
     """
     return [Row(group, settings[0], tuple(run(setting) for setting in settings)) for group, settings in plan]
 
 
 def as_csv(table: Sequence[Row]) -> str:
-    """All rows, lengths in centimetres, angles in degrees."""
+    """All rows as CSV, lengths in centimetres, angles in degrees."""
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     writer.writeheader()
@@ -191,46 +193,61 @@ def as_csv(table: Sequence[Row]) -> str:
 
 
 def as_markdown(table: Sequence[Row]) -> str:
-    """Two tables: the paper's rows, and what changes them."""
+    """Two Markdown tables: the rows of the paper, and the variations.
+
+    Args:
+        table: rows as `rows` makes them.
+    """
     own = [row.numbers() for row in table if row.group == TABLE]
     end = {"goal": "endpoint", "start": "starting point"}[own[0]["displaced"]]
-    lines = [
-        f"| trajectory | {end} displaced by (units) | paper's loss | our loss | at the start | of the true path | 95 % of the drop after "
-        "| pick error | waypoint error | shape error |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+    heads = [
+        "trajectory",
+        f"{end} displaced by (units)",
+        "paper's loss",
+        "our loss",
+        "at the start",
+        "of the true path",
     ]
+    heads += ["95 % of the drop after", "pick error", "waypoint error", "shape error"]
+    cells = []
     for n in own:
         paper = "" if n["paper_loss"] is None else f"{n['paper_loss']:.4f}"
         spread = "" if n["loss_spread"] is None else f" ± {n['loss_spread']:.4f}"
-        lines.append(
-            f"| {n['trajectory']} | {vector(n['displacement'])} | {paper} | {n['loss']:.4f}{spread} | {n['start_loss']:.4f} "
-            f"| {n['true_loss']:.4f} | {n['settled']:.0f} iterations | {n['pick_cm']:.1f} cm, {n['pick_degrees']:.0f}° "
-            f"| {n['waypoint_cm']:.1f} cm | {n['shape_cm']:.1f} cm |"
+        cells.append(
+            [
+                n["trajectory"],
+                vector(n["displacement"]),
+                paper,
+                f"{n['loss']:.4f}{spread}",
+                f"{n['start_loss']:.4f}",
+                f"{n['true_loss']:.4f}",
+                f"{n['settled']:.0f} iterations",
+                f"{n['pick_cm']:.1f} cm, {n['pick_degrees']:.0f}°",
+                f"{n['waypoint_cm']:.1f} cm",
+                f"{n['shape_cm']:.1f} cm",
+            ]
         )
     flips = sum(n["flips"] for n in own)
-    lines += [
-        "",
-        f"Means over {own[0]['seeds']} seeds, ± their standard deviation. Picks turned by more than 170°: {flips}.",
-    ]
+    words = f"Means over {own[0]['seeds']} seeds, ± their standard deviation. "
+    words += f"Picks with a rotation error above 170°: {flips}."
+    blocks = [markdown(heads, cells), words]
     groups = [group for group in dict.fromkeys(row.group for row in table) if group != TABLE]
-    if not groups:
-        return "\n".join(lines) + "\n"
-    names = ", ".join(f"{trajectory} {vector(moved)}" for trajectory, moved in SWEPT)
-    lines += [
-        "",
-        f"What changes it; one seed, three values in a cell: {names}.",
-        "",
-        "| changed | loss | descriptor loss | pick error (cm) | pick error (degrees) | waypoint error (cm) | true path from found path (cm) "
-        "| shape error (cm) | longest step over mean |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    if groups:
+        names = ", ".join(f"{trajectory} {vector(moved)}" for trajectory, moved in SWEPT)
+        blocks += [f"Variations; one seed, three values in a cell: {names}.", _variations(table, groups)]
+    return "\n\n".join(blocks) + "\n"
+
+
+def _variations(table: Sequence[Row], groups: Sequence[str]) -> str:
+    heads = ["changed", "loss", "descriptor loss", "pick error (cm)", "pick error (degrees)", "waypoint error (cm)"]
+    heads += ["true path from estimated path (cm)", "shape error (cm)", "longest step over mean"]
     columns = {"loss": ".4f", "descriptor_loss": ".4f", "pick_cm": ".1f", "pick_degrees": ".0f", "waypoint_cm": ".1f"}
     columns |= {"path_cm": ".1f", "shape_cm": ".1f", "longest_step": ".1f"}
+    cells = []
     for group in groups:
         numbers = [row.numbers() for row in table if row.group == group]
-        cells = (", ".join(format(n[name], style) for n in numbers) for name, style in columns.items())
-        lines.append(f"| {group} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+        cells.append([group, *(", ".join(format(n[name], form) for n in numbers) for name, form in columns.items())])
+    return markdown(heads, cells)
 
 
 def vector(displacement: tuple[float, float, float]) -> str:

@@ -1,4 +1,4 @@
-"""Pictures of the benchmark: what the truth is, how far methods are from it, and how sure the library may be."""
+"""Pictures of `tdf benchmark`: the ground truth, the errors of all methods, and the reliability of the confidence."""
 
 from collections.abc import Mapping, Sequence
 
@@ -6,36 +6,39 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from tdf_jax.evaluation.path_scores import MISSED, Score, by_method
+from tdf_jax.evaluation.path_scores import Score, by_method
 from tdf_jax.evaluation.path_tasks import Task
+from tdf_jax.evaluation.statistics import FINE, SUCCESS
 from tdf_jax.viz.scene3d import WIDTH, View, bounds, panels, triangles_of
 from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, STYLE, TRUTH, blank_figure, legend_of
 
 LINES = ("-", "--", "-.", ":")
-FARTHEST = 20.0  # centimetres that errors are drawn to
+MAX_ERROR = 20.0  # centimetres, the end of the axis
 
 
 def truth_figure(tasks: Sequence[Task]) -> Figure:
-    """The true trajectories of tasks, each with the demonstration's path where it was shown."""
+    """The true trajectories of tasks, each with the demonstrated path in its own place.
+
+    Args:
+        tasks: the tasks, one panel each.
+    """
     views = []
     for task in tasks:
         mesh = task.case.object_b.mesh.copy().apply_transform(task.case.T_world_b)
         view = View(task.case.points_b, triangles_of(mesh), task.expected, None, task.demonstration.trajectory)
-        moved = (
-            ""
-            if task.displacement == "none"
-            else f", goal {'opposite' if task.displacement == 'opposite' else 'moved by ' + task.displacement}"
+        words = {"none": "", "opposite": ", goal opposite"}.get(
+            task.displacement, f", goal moved by {task.displacement}"
         )
-        views.append((task.path.replace("_", " ") + moved, view))
+        views.append((task.path.replace("_", " ") + words, view))
     return panels(views, 3, bounds(np.asarray(tasks[0].demonstration.query)), tasks[0].expected.num_poses, share=0.78)
 
 
 def errors_figure(scores: Sequence[Score], bold: str) -> Figure:
-    """Shares of tasks with pick and path errors up to a distance, for every method.
+    """Shares of tasks whose pick and path errors are at most a distance, for every method.
 
     Args:
-        scores: of all methods.
-        bold: the method drawn bold.
+        scores: scores of all methods.
+        bold: method that is drawn bold.
     """
     groups = by_method(scores)
     with matplotlib.rc_context(STYLE):
@@ -53,13 +56,13 @@ def errors_figure(scores: Sequence[Score], bold: str) -> Figure:
                     else {"color": COLOURS(index / len(groups)), "lw": 1.1, "ls": LINES[index % len(LINES)]}
                 )
                 axes.step(
-                    np.concatenate([[0], values, [FARTHEST]]),
+                    np.concatenate([[0], values, [MAX_ERROR]]),
                     np.concatenate([[0], shares, shares[-1:]]),
                     where="post",
                     label=method,
                     **style,
                 )
-            axes.set(xlabel=f"{name} error (cm)", xscale="symlog", xlim=(0, FARTHEST), ylim=(0, 1.01))
+            axes.set(xlabel=f"{name} error (cm)", xscale="symlog", xlim=(0, MAX_ERROR), ylim=(0, 1.01))
             axes.set_xticks([0, 0.5, 1, 2, 5, 10, 20], ["0", "0.5", "1", "2", "5", "10", "20"])
             axes.minorticks_off()
             axes.spines[["top", "right"]].set_visible(False)
@@ -71,18 +74,19 @@ def errors_figure(scores: Sequence[Score], bold: str) -> Figure:
 
 
 def reliability_figure(scores: Sequence[Score], bins: Sequence[Mapping]) -> Figure:
-    """How often picks of a confidence were right, and how many there were.
+    """The share of right picks against the confidence, and the number of picks of each confidence.
 
     Args:
-        scores: those without a confidence are left out.
-        bins: of `tdf_jax.uncertainty.calibration.bins`.
+        scores: scores; those without a confidence are left out.
+        bins: bins as `tdf_jax.uncertainty.calibration.bins` makes them.
     """
-    sure = [one for one in scores if one.confidence is not None]
-    predicted, right = np.array([one.confidence for one in sure]), np.array([one.succeeds(*MISSED) for one in sure])
+    confident = [one for one in scores if one.confidence is not None]
+    predicted = np.array([one.confidence for one in confident])
+    right = np.array([one.succeeds(SUCCESS) for one in confident])
     with matplotlib.rc_context(STYLE):
         figure = blank_figure(3.6, 3.8, layout="constrained")
         axes, counts = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
-        axes.plot([0, 1], [0, 1], color=CLOUD, lw=0.8, ls="--", label="as often as said")
+        axes.plot([0, 1], [0, 1], color=CLOUD, lw=0.8, ls="--", label="ideal")
         means = np.array([one["predicted"] for one in bins])
         rates = np.array([one["right"] for one in bins])
         limits = np.array([one["interval"] for one in bins])
@@ -115,22 +119,22 @@ def reliability_figure(scores: Sequence[Score], bins: Sequence[Mapping]) -> Figu
     return figure
 
 
-def demonstrations_figure(found: Sequence[Mapping]) -> Figure:
+def demonstrations_figure(counts: Sequence[Mapping]) -> Figure:
     """Success and median error of picks against the number of demonstrations.
 
     Args:
-        found: rows of `tdf_jax.evaluation.demonstration_count.Learnt`, as mappings.
+        counts: `tdf_jax.evaluation.demonstration_count.CountErrors`, as mappings.
     """
     with matplotlib.rc_context(STYLE):
         figure = blank_figure(WIDTH, 2.8, layout="constrained")
         left, right = figure.subplots(1, 2)
-        clouds = list(dict.fromkeys(one["clouds"] for one in found))
-        ways = list(dict.fromkeys(one["way"] for one in found))
+        clouds = list(dict.fromkeys(one["clouds"] for one in counts))
+        ways = list(dict.fromkeys(one["way"] for one in counts))
         for condition in clouds:
-            first = [one for one in found if one["clouds"] == condition and one["count"] == 1]
+            first = [one for one in counts if one["clouds"] == condition and one["count"] == 1]
             for way in ways:
                 rows = first + [
-                    one for one in found if one["clouds"] == condition and one["way"] == way and one["count"] > 1
+                    one for one in counts if one["clouds"] == condition and one["way"] == way and one["count"] > 1
                 ]
                 rows.sort(key=lambda one: one["count"])
                 style = {
@@ -140,18 +144,16 @@ def demonstrations_figure(found: Sequence[Mapping]) -> Figure:
                     "ms": 3,
                     "label": f"{condition}, {way}",
                 }
-                counts = [one["count"] for one in rows]
-                within = [
-                    np.mean((np.array(one["distances"]) <= 0.01) & (np.array(one["angles"]) <= 10)) for one in rows
-                ]
-                left.plot(counts, within, **style)
-                right.plot(counts, [CENTIMETRES * np.median(one["distances"]) for one in rows], **style)
+                numbers = [one["count"] for one in rows]
+                within = [np.mean(FINE.holds(one["distances"], one["angles"])) for one in rows]
+                left.plot(numbers, within, **style)
+                right.plot(numbers, [CENTIMETRES * np.median(one["distances"]) for one in rows], **style)
         left.set(ylabel="share within 1 cm and 10°", ylim=(0, 1.02))
         right.set(ylabel="median error (cm)")
         right.set_ylim(0, 1.1 * right.get_ylim()[1])
         for axes in (left, right):
             axes.set_xlabel("demonstrations")
-            axes.set_xticks(sorted({one["count"] for one in found}))
+            axes.set_xticks(sorted({one["count"] for one in counts}))
             axes.spines[["top", "right"]].set_visible(False)
             axes.grid(alpha=0.25, lw=0.5)
         labels = legend_of(left)

@@ -32,8 +32,8 @@ def figure1(runs: dict[str, Run], scene: Scene) -> Figure:
     truth = Trajectory(whole.expected)
     views = {
         "reference": View(shown.points, triangles_of(scene.meshes[0]), shown.trajectory),
-        "random start": View(trajectory=Trajectory(whole.starts[whole.best]), **test),
-        r"after $l_t$ alone": View(trajectory=Trajectory(alone.found[whole.best]), expected=truth, **test),
+        "random start": View(trajectory=Trajectory(whole.initial_trajectories[whole.best]), **test),
+        r"after $l_t$ alone": View(trajectory=Trajectory(alone.trajectories[whole.best]), expected=truth, **test),
         r"after $l_t + k\,l_c$": View(trajectory=Trajectory(whole.trajectory), expected=truth, **test),
     }
     return panels(list(views.items()), 2, bounds(np.asarray(shown.query)), len(whole.expected))

@@ -1,4 +1,4 @@
-"""Pictures of an evaluation: what the network takes objects to be, and where it takes their places to be."""
+"""Pictures of `tdf evaluate`: reconstructed shapes, and estimated poses of places."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -14,12 +14,12 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 from tdf_jax.viz import polygons3d
 from tdf_jax.viz.style import CENTIMETRES, INK, LIGHT, STYLE, TRUTH
 
-FOUND = "#2a6f97"
-VIEW = {"elev": 28, "azim": -55}  # into the cup, its handle to the right
+ESTIMATE = "#2a6f97"
+VIEW = {"elev": 28, "azim": -55}  # shows the inside of a cup, and its handle to the right
 PIECES = 25  # longest edge of a drawn triangle, as a part of the diagonal; see `solid`
 COLUMNS = 5
 PANEL, WORDS, MARGIN = 1.7, 0.45, 0.35  # inches: edge of a panel, height of the words above it, and around all
-ZOOM = 1.6814  # with it, an orthographic panel shows as much as the axes' limits span
+ZOOM = 1.6814  # an orthographic panel of this zoom shows exactly the span of the axes' limits
 BAR = 0.05  # metres, the scale bar
 
 
@@ -28,12 +28,13 @@ class Panel:
     """One object to draw, in its canonical frame.
 
     Attributes:
-        name: of the object.
-        overlap: what is said of the reconstruction, a few words.
-        error: the same of the place that was found.
-        triangles: the true surface, metres.
-        found: the reconstructed surface, metres; may have no triangle.
-        T_object_true, T_object_found: the place's frame, and what was found for it, 4x4.
+        name: name of the object.
+        overlap: words about the reconstruction.
+        error: words about the estimated place.
+        triangles: true surface, (faces, 3, 3), metres.
+        reconstructed: reconstructed surface, (others, 3, 3), metres; it may have no triangle.
+        T_object_true: true frame of the place, 4x4.
+        T_object_estimate: estimated frame of the place, 4x4.
         size: edge of the box of query points, metres.
     """
 
@@ -41,20 +42,22 @@ class Panel:
     overlap: str
     error: str
     triangles: Float[np.ndarray, "faces 3 3"]
-    found: Float[np.ndarray, "others 3 3"]
+    reconstructed: Float[np.ndarray, "others 3 3"]
     T_object_true: Float[np.ndarray, "4 4"]
-    T_object_found: Float[np.ndarray, "4 4"]
+    T_object_estimate: Float[np.ndarray, "4 4"]
     size: float
 
 
 def reconstruction_figure(panels: Sequence[Panel], title: str = "") -> Figure:
-    """Every object's true surface above its reconstruction, all at one scale."""
-    contents = [np.concatenate([panel.triangles, panel.found]).reshape(-1, 3) for panel in panels]
+    """The true surface of every object above its reconstruction, all at one scale."""
+    contents = [np.concatenate([panel.triangles, panel.reconstructed]).reshape(-1, 3) for panel in panels]
     edge = _edge(contents)
     with matplotlib.rc_context(STYLE):
         figure = _figure(len(panels), 2, title, edge)
         for index, (panel, content) in enumerate(zip(panels, contents)):
-            for row, (label, triangles) in enumerate({"true": panel.triangles, "reconstructed": panel.found}.items()):
+            for row, (label, triangles) in enumerate(
+                {"true": panel.triangles, "reconstructed": panel.reconstructed}.items()
+            ):
                 axes = _axes(figure, index, 2, row, label)
                 _draw(axes, _surface(triangles), content, edge)
                 if not len(triangles):
@@ -64,13 +67,13 @@ def reconstruction_figure(panels: Sequence[Panel], title: str = "") -> Figure:
 
 
 def transfer_figure(panels: Sequence[Panel], title: str = "") -> Figure:
-    """Every object with the box of query points at the true place, dashed, and where it was found, all at one scale."""
-    true, found = ([_corners(T, panel.size) for T, panel in zip(several, panels)] for several in (
-        [panel.T_object_true for panel in panels], [panel.T_object_found for panel in panels]))  # fmt: skip
+    """Every object with the box of query points at the true place, dashed, and at the estimated place, at one scale."""
+    true = [_corners(panel.T_object_true, panel.size) for panel in panels]
+    estimated = [_corners(panel.T_object_estimate, panel.size) for panel in panels]
     contents = []
-    for panel, *boxes in zip(panels, true, found):
+    for panel, *boxes in zip(panels, true, estimated):
         low, high = panel.triangles.min(axis=(0, 1)), panel.triangles.max(axis=(0, 1))
-        reach = (high - low).max()  # a box found still farther away is cut, rather than make the others small
+        reach = (high - low).max()  # a box beyond this is cut off, so that it does not make the other objects small
         contents.append(
             np.concatenate([panel.triangles.reshape(-1, 3), np.clip(np.concatenate(boxes), low - reach, high + reach)])
         )
@@ -80,17 +83,17 @@ def transfer_figure(panels: Sequence[Panel], title: str = "") -> Figure:
         for index, panel in enumerate(panels):
             pieces = _surface(panel.triangles)
             pieces += polygons3d.box(CENTIMETRES * true[index], TRUTH, filled=False, dashed=True)
-            pieces += polygons3d.box(CENTIMETRES * found[index], FOUND)
+            pieces += polygons3d.box(CENTIMETRES * estimated[index], ESTIMATE)
             _draw(_axes(figure, index, 1, 0, ""), pieces, contents[index], edge)
             _name(figure, index, 1, f"{panel.name}\n{panel.error}")
-        lines = [Line2D([], [], color=TRUTH, ls=(0, (3, 2))), Line2D([], [], color=FOUND)]
-        words = ["query box at the true place", "found; the filled face is +x"]
+        lines = [Line2D([], [], color=TRUTH, ls=(0, (3, 2))), Line2D([], [], color=ESTIMATE)]
+        words = ["query box at the true place", "estimated; the filled face is +x"]
         figure.legend(lines, words, loc="lower right", ncols=2, frameon=False, bbox_to_anchor=(1.0, 0.0))
     return figure
 
 
 def _figure(count: int, rows: int, title: str, edge: float) -> Figure:
-    """Room for blocks of `COLUMNS` objects below each other, each of so many rows; with a title and a scale bar."""
+    """An empty figure for blocks of `COLUMNS` objects below each other, with a title and a scale bar."""
     blocks = -(-count // COLUMNS)
     width = max(2 * MARGIN + min(COLUMNS, count) * PANEL, 5.2)
     height = 2 * MARGIN + blocks * (WORDS + rows * PANEL)
@@ -104,7 +107,7 @@ def _figure(count: int, rows: int, title: str, edge: float) -> Figure:
 
 
 def _corner(figure: Figure, index: int, rows: int) -> tuple[float, float]:
-    """Left and top of an object's panels, inches from the lower left."""
+    """The left and upper edge of the panels of an object, inches from the lower left."""
     block, column = divmod(index, COLUMNS)
     return MARGIN + column * PANEL, figure.get_figheight() - MARGIN - WORDS - block * (WORDS + rows * PANEL)
 
@@ -126,7 +129,7 @@ def _axes(figure: Figure, index: int, rows: int, row: int, label: str) -> Axes3D
 
 
 def _surface(triangles) -> polygons3d.Pieces:
-    """Shaded pieces, in centimetres, cut small enough to be painted in the right order."""
+    """Shaded pieces, in centimetres, cut small enough that matplotlib paints them in the right order."""
     from trimesh.remesh import subdivide_to_size
 
     if not len(triangles):
@@ -142,7 +145,7 @@ def _corners(T, size):
 
 
 def _across() -> np.ndarray:
-    """The view's directions to the right and up, (2, 3)."""
+    """The directions to the right and up in the view, (2, 3)."""
     up, around = np.radians(VIEW["elev"]), np.radians(VIEW["azim"])
     return np.array([
         [-np.sin(around), np.cos(around), 0.0],
@@ -151,7 +154,7 @@ def _across() -> np.ndarray:
 
 
 def _edge(contents) -> float:
-    """Edge, metres, of the square that the largest content fills."""
+    """Edge of the square that the largest content fills, metres."""
     return 1.04 * max(float(np.ptp(content @ _across().T, axis=0).max()) for content in contents)
 
 

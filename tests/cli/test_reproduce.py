@@ -16,8 +16,8 @@ from tdf_jax.paper.runs import Run
 from tdf_jax.paper.setting import Setting
 from tdf_jax.viz import paper as pictures
 
-TINY = Setting(poses=3, iterations=2, queries=8, inits=2)
-WORDS = ("--poses", "3", "--iterations", "2", "--queries", "8", "--inits", "2")
+TINY = Setting(num_poses=3, iterations=2, queries=8, num_starts=2)
+WORDS = ("--num-poses", "3", "--iterations", "2", "--queries", "8", "--num-starts", "2")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -75,9 +75,9 @@ def test_figure_1_shows_the_reference_a_start_and_both_results(scene):
     ]
     shown = [
         np.asarray(scene.demonstration.trajectory.wxyz_xyz),
-        runs["l_t + l_c"].starts[1],
-        runs["l_t"].found[1],
-        runs["l_t + l_c"].found[1],
+        runs["l_t + l_c"].initial_trajectories[1],
+        runs["l_t"].trajectories[1],
+        runs["l_t + l_c"].trajectories[1],
     ]
     for axes, path in zip(panels, shown):
         np.testing.assert_allclose(path_of(axes, "trajectory of the query frame"), path[:, 4:], atol=1e-6)
@@ -94,7 +94,9 @@ def test_figure_4_shows_test_reference_and_truth_of_six_runs(scene):
     assert len(panels) == 6
     for axes, (name, run) in zip(panels, runs.items()):
         assert axes.get_title().startswith(name[0]) and ("0.3" in axes.get_title()) == any(name[1])
-        np.testing.assert_allclose(path_of(axes, "trajectory of the query frame"), run.found[1][:, 4:], atol=1e-6)
+        np.testing.assert_allclose(
+            path_of(axes, "trajectory of the query frame"), run.trajectories[1][:, 4:], atol=1e-6
+        )
         np.testing.assert_allclose(path_of(axes, "true trajectory and pick"), run.expected[:, 4:], atol=1e-6)
         reference = np.asarray(scene.demonstration.trajectory.translations)
         np.testing.assert_allclose(path_of(axes, "reference trajectory"), reference, atol=1e-6)

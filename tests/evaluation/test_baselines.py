@@ -10,10 +10,10 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.baselines import (
     aligned,
     chamfer_distance,
+    every_registration,
     iterative_closest_points,
     principal_axes,
     rigid_motion,
-    settled_points,
 )
 from tdf_jax.evaluation.cases import mug_case
 from tdf_jax.evaluation.pick_transfer import place_errors
@@ -55,7 +55,7 @@ def test_icp_finds_the_motion_from_one_of_several_starts(cloud):
 def test_icp_tells_where_every_start_settles(cloud):
     T = motion(1)
     starts = np.stack([Rotation.from_rotvec([2.5, 0, 0]).as_matrix() @ T[:3, :3], T[:3, :3]])
-    motions, costs = settled_points(cloud, moved(T, cloud), starts)
+    motions, costs = every_registration(cloud, moved(T, cloud), starts)
     np.testing.assert_allclose(motions[1], T, atol=1e-6)
     assert costs[1] < 1e-12 < costs[0]
     nearest = cKDTree(moved(motions[0], cloud)).query(moved(T, cloud))[0]
@@ -91,7 +91,7 @@ def test_the_place_is_carried_with_the_object(monkeypatch, method):
     monkeypatch.setattr(
         "tdf_jax.evaluation.baselines.iterative_closest_points", lambda a, b, rotations: seen.append(rotations) or T_b_a
     )
-    found = aligned(method, [case, case], seed=3, inits=4, progress=False)
+    found = aligned(method, [case, case], seed=3, num_starts=4, progress=False)
     distance, angle = place_errors(found, [case, case])
     assert distance.max() < 1e-6 and angle.max() < 0.1
     if method == "ICP":

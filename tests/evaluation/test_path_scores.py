@@ -19,16 +19,17 @@ import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import EnergyWeights, trajectory_energy
 from tdf_jax.energy.residual import pick_residual
-from tdf_jax.evaluation import demonstration_count as demonstrations, methods, path_scores as scores
+from tdf_jax.evaluation import demonstration_count as demonstrations, path_methods as methods
 from tdf_jax.evaluation.annotated_meshes import AnnotatedMesh
 from tdf_jax.evaluation.cases import mug_case
-from tdf_jax.evaluation.demonstration_count import Learnt, learnt
-from tdf_jax.evaluation.methods import METHODS, Attempt, Attempts
+from tdf_jax.evaluation.demonstration_count import CountErrors, count_errors
 from tdf_jax.evaluation.metrics import pose_error
-from tdf_jax.evaluation.path_page import LISTED, markdown, page, record, sections
-from tdf_jax.evaluation.path_runs import run
-from tdf_jax.evaluation.path_scores import Score, by_method, interval, score, summarised
+from tdf_jax.evaluation.path_methods import METHODS, Attempt, Attempts
+from tdf_jax.evaluation.path_report import LISTED, page, record, sections
+from tdf_jax.evaluation.path_scores import Score, by_method, run, score, summary
 from tdf_jax.evaluation.path_tasks import DISPLACEMENTS, carried_by, make_task, mesh_index
+from tdf_jax.evaluation.statistics import SUCCESS, THRESHOLDS, Threshold, bootstrap_interval
+from tdf_jax.evaluation.tables import markdown
 from tdf_jax.geometry.paths import PATHS
 from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.geometry.trajectory import Trajectory
@@ -236,10 +237,10 @@ NDF = ("NDF pick, rigid replay", "NDF pick, carried")
 MANY = {"ICP, 64 starts": 64, "NDF pick, 64 starts, carried": 64}
 CARRIED = ("PCA", "ICP", "random weights", "NDF pick, carried", *MANY, "tdf_jax", "oracle correspondences")
 ENERGIES = {
-    "TDF, k = 0": EnergyWeights(correlation=0.0, lever=0.05),
-    "TDF, k = 0.02": EnergyWeights(correlation=0.02, lever=0.05),
-    "TDF, k = 0.2": EnergyWeights(correlation=0.2, lever=0.05),
-    "TDF, k = 0.02, plain norm": EnergyWeights(correlation=0.02, lever=1.0),
+    "TDF, k = 0": EnergyWeights(correlation=0.0, rotation_scale=0.05),
+    "TDF, k = 0.02": EnergyWeights(correlation=0.02, rotation_scale=0.05),
+    "TDF, k = 0.2": EnergyWeights(correlation=0.2, rotation_scale=0.05),
+    "TDF, k = 0.02, plain norm": EnergyWeights(correlation=0.02, rotation_scale=1.0),
     "TDF, l_p": EnergyWeights(correlation=0.0, compensator=0.02),
 }
 
@@ -334,7 +335,7 @@ def test_the_papers_energy_about_the_carried_path_is_that_of_a_demonstration_alr
     field, reference = encoded
     carried = jnp.asarray(attempts["tdf_jax"].trajectories[attempts["tdf_jax"].best])
     about = dataclasses.replace(reference, trajectory=Trajectory(carried).shifted(-field.origin))
-    energy, weights = jax.jit(trajectory_energy), EnergyWeights(correlation=k, lever=0.05)
+    energy, weights = jax.jit(trajectory_energy), EnergyWeights(correlation=k, rotation_scale=0.05)
     for row, found in zip(attempts[method].trajectories, attempts[method].scores):
         assert found == pytest.approx(float(energy(Trajectory(jnp.asarray(row)), field, about, weights)), rel=1e-3)
     assert attempts[method].scores.min() <= float(energy(Trajectory(carried), field, about, weights)) * 1.001
@@ -747,7 +748,7 @@ def many():
 
 def test_errors_are_summarised_by_hand(many):
     ours = by_method(many)["tdf_jax"]
-    row = summarised(ours)
+    row = summary(ours)
     distance, angle = (np.array([getattr(one, name) for one in ours]) for name in ("distances", "angles"))
     assert (row["tasks"], row["objects"]) == (60, 20)
     for name, values in {
@@ -781,38 +782,57 @@ def test_errors_are_summarised_by_hand(many):
 
 
 def test_flips_are_counted_and_no_penetration_is_none():
-    row = summarised([made(angle=171.0), made(angle=169.0), made(angle=180.0)])
+    row = summary([made(angle=171.0), made(angle=169.0), made(angle=180.0)])
     assert row["flips"] == 2 and row["penetration_mean"] is None
 
 
 @pytest.mark.parametrize(("pick", "angle", "right"), [(0.02, 20.0, True), (0.0201, 0.0, False), (0.0, 20.1, False)])
 def test_success_needs_both_distance_and_angle(pick, angle, right):
-    assert made(pick, angle).succeeds(0.02, 20.0) is right
+    assert made(pick, angle).succeeds(Threshold(0.02, 20.0)) is right
 
 
 def test_intervals_are_over_objects_contain_the_statistic_and_are_the_same_again(many):
     ours = by_method(many)["tdf_jax"]
-    row = summarised(ours)
-    assert row == summarised(ours)
-    for name, number in [(f"interval_{k}", row[f"success_{k}"]) for k in scores.THRESHOLDS] + [
+    row = summary(ours)
+    assert row == summary(ours)
+    for name, number in [(f"interval_{k}", row[f"success_{k}"]) for k in THRESHOLDS] + [
         ("interval_path_median_cm", row["path_median_cm"])
     ]:
         low, high = row[name]
         assert low <= number <= high and low < high
-    alone = summarised([dataclasses.replace(one, instance="mug 0") for one in ours])
+    alone = summary([dataclasses.replace(one, instance="mug 0") for one in ours])
     assert all(value is None for name, value in alone.items() if name.startswith("interval"))
     # The interval of a mean over equal groups is about that of the normal approximation, over objects.
     values = np.array([one.distances[0] for one in ours])
-    low, high = interval(ours, values, np.mean, 0)
+    mugs = [one.instance for one in ours]
+    low, high = bootstrap_interval(values, mugs)
     means = values.reshape(20, 3).mean(axis=1)
     assert high - low == pytest.approx(2 * 1.96 * means.std() / np.sqrt(20), rel=0.1)
-    assert interval(ours, values, np.mean, 1) != [low, high]
+    assert bootstrap_interval(values, mugs, seed=1) != [low, high]
 
 
 def test_objects_are_drawn_whole_with_all_of_their_tasks():
     """19 tasks of a mug that always succeeds and one of a mug that never does are two observations."""
-    ones = [made(instance="a")] * 19 + [made(1.0, instance="b")]
-    assert interval(ones, np.array([1.0] * 19 + [0.0]), np.mean, 0) == [0.0, 1.0]
+    assert bootstrap_interval(np.array([1.0] * 19 + [0.0]), ["a"] * 19 + ["b"]) == [0.0, 1.0]
+
+
+@pytest.mark.parametrize("statistic", ["mean", "median"])
+def test_an_interval_is_that_of_resamples_one_by_one(statistic):
+    rng = np.random.default_rng(1)
+    values, objects = rng.gamma(1.0, 1.0, 41), rng.integers(0, 9, 41)
+    names = list(dict.fromkeys(objects))
+    draws = np.random.default_rng(5).choice(len(names), (2000, len(names)))
+    resampled = [
+        getattr(np, statistic)(np.concatenate([values[objects == names[one]] for one in draw])) for draw in draws
+    ]
+    expected = np.percentile(resampled, (2.5, 97.5))
+    np.testing.assert_allclose(bootstrap_interval(values, objects, statistic, seed=5), expected, rtol=1e-12)
+
+
+def test_thresholds_have_one_name_and_one_label():
+    for name, threshold in THRESHOLDS.items():
+        assert threshold.label().replace(" ", "").replace(",", "_") == name
+    assert THRESHOLDS["5mm_5deg"].label("°") == "5 mm, 5°"
 
 
 def test_methods_keep_their_order():
@@ -966,7 +986,7 @@ def makers(task, case):
 def outcomes(makers, model, folder, names=WANTED, **settings):
     return [
         (one.index, name, *map(np.asarray, vars(found).values()))
-        for one, name, found in run(makers, model, names, folder, **{"inits": INITS, "progress": False} | settings)
+        for one, name, found in run(makers, model, names, folder, **{"num_starts": INITS, "progress": False} | settings)
     ]
 
 
@@ -1032,7 +1052,7 @@ def test_more_tasks_or_methods_compute_what_is_missing(makers, model, tmp_path, 
 
 
 def test_an_interrupted_run_goes_on(makers, model, tmp_path, computed):
-    going = run(makers, model, WANTED, tmp_path, inits=INITS, progress=False)
+    going = run(makers, model, WANTED, tmp_path, num_starts=INITS, progress=False)
     for _ in range(4):
         next(going)
     going.close()
@@ -1041,10 +1061,10 @@ def test_an_interrupted_run_goes_on(makers, model, tmp_path, computed):
     assert len(computed) == 9
 
 
-@pytest.mark.parametrize("changed", ["seed", "inits", "model", "goal", "clouds", "instance"])
+@pytest.mark.parametrize("changed", ["seed", "num_starts", "model", "goal", "clouds", "instance"])
 def test_what_depends_on_other_settings_is_kept_apart(task, model, tmp_path, computed, changed):
     outcomes([lambda: task], model, tmp_path, ("copy",))
-    settings = {"seed": {"seed": 1}, "inits": {"inits": 3}}.get(changed, {})
+    settings = {"seed": {"seed": 1}, "num_starts": {"num_starts": 3}}.get(changed, {})
     if changed == "model":
         model = dataclasses.replace(model, params=jax.tree.map(lambda leaf: 2 * leaf, model.params))
     other = {
@@ -1097,7 +1117,7 @@ def tasks(case):
 
 
 def asked(tasks, model, folder, counts, **settings):
-    return learnt([lambda task=task: task for task in tasks], model, counts, folder, progress=False, **settings)
+    return count_errors([lambda task=task: task for task in tasks], model, counts, folder, progress=False, **settings)
 
 
 def test_picks_are_learnt_from_every_number_in_every_way(tasks, model, tmp_path, shown):
@@ -1150,7 +1170,7 @@ def test_errors_of_picks_are_in_metres_and_degrees(tasks, model, tmp_path, shown
         )
 
     monkeypatch.setattr(demonstrations, "carry", found)
-    (one,) = learnt([lambda task=task: make(task) for task in tasks], model, (1,), tmp_path, progress=False)
+    (one,) = count_errors([lambda task=task: make(task) for task in tasks], model, (1,), tmp_path, progress=False)
     np.testing.assert_allclose(one.distances, 0.03, atol=1e-6)
     np.testing.assert_allclose(one.angles, [41, 42, 43], atol=0.02)
     assert goals == 3 * [{"fix_last": False}]  # the goal is not of the pick
@@ -1176,7 +1196,7 @@ def test_picks_are_learnt_on_every_fifth_task(tasks, case, model, tmp_path, show
 
 
 def test_no_number_asks_for_nothing(model, tmp_path):
-    assert learnt([lambda: pytest.fail("made a task")], model, (), tmp_path, progress=False) == []
+    assert count_errors([lambda: pytest.fail("made a task")], model, (), tmp_path, progress=False) == []
 
 
 def test_a_number_asked_for_twice_counts_once(tasks, model, tmp_path, shown):
@@ -1211,14 +1231,14 @@ SETTINGS = {
     "seed": 0,
     "height": 0.12,
     "clouds": ("full",),
-    "inits": 2,
+    "num_starts": 2,
     "meshes": None,
-    "poses": 6,
+    "num_poses": 6,
     "demonstrations": (),
 }
-LEARNT = [
-    Learnt("full", 1, "mean", [0.004, 0.012, 0.04], [5.0, 9.0, 50.0]),
-    Learnt("full", 3, "median", [0.004, 0.006, 0.008], [1.0, 2.0, 11.0]),
+COUNTS = [
+    CountErrors("full", 1, "mean", [0.004, 0.012, 0.04], [5.0, 9.0, 50.0]),
+    CountErrors("full", 3, "median", [0.004, 0.006, 0.008], [1.0, 2.0, 11.0]),
 ]
 
 
@@ -1235,7 +1255,7 @@ def numbers(text):
 
 @pytest.fixture(scope="module")
 def extras(many):
-    return sections(many, LEARNT)
+    return sections(many, COUNTS)
 
 
 @pytest.fixture(scope="module")
@@ -1290,7 +1310,7 @@ def test_the_worst_failures_are_listed_by_their_turn(many, text):
     known = sum(one.best_pick[0] <= 0.02 and one.best_pick[1] <= 20 for one in failed)
     assert len(failed) > LISTED and 0 < known < len(failed)
     assert (
-        f"Of 60 picks of `tdf_jax`, {len(failed)} are off by more than 2 cm or 20°; in {known} of those another candidate was within."
+        f"Of 60 picks of `tdf_jax`, {len(failed)} are off by more than 2 cm or 20°; for {known} of them, another candidate is within both bounds."
         in text
     )
     rows = tables(text)[4][2:]
@@ -1304,7 +1324,7 @@ def test_the_worst_failures_are_listed_by_their_turn(many, text):
 
 def test_the_one_pick_that_failed_is_listed(model):
     text = page([made(), made(0.03, instance="mug 7")], model, SETTINGS, {})
-    assert "Of 2 picks of `tdf_jax`, 1 are off by more than 2 cm or 20°; in 0 of those" in text
+    assert "Of 2 picks of `tdf_jax`, 1 are off by more than 2 cm or 20°; for 0 of them" in text
     assert [row[0] for row in tables(text)[-1][2:]] == ["mug 7"]
 
 
@@ -1333,8 +1353,8 @@ def test_confidences_are_told_by_bins(many, text, extras):
     means = [float(row[0]) for row in rows]
     assert means == sorted(means)
     share = sum(int(row[1]) * float(row[2]) for row in rows) / 60
-    assert share == pytest.approx(np.mean([one.succeeds(0.02, 20) for one in ours]), abs=1e-3)
-    assert f"Mean difference of confidence and share: {extras['reliability']['calibration_error']:.3f}." in text
+    assert share == pytest.approx(np.mean([one.succeeds(SUCCESS) for one in ours]), abs=1e-3)
+    assert f"share of right picks is {extras['reliability']['calibration_error']:.3f}." in text
 
 
 def test_several_demonstrations_are_told(text):
@@ -1357,7 +1377,7 @@ def test_clouds_have_tables_of_their_own(many, model):
 
 def test_the_page_tells_how_it_was_made(text):
     assert (
-        "`tdf benchmark --weights small --pairs 60 --seed 0 --height 0.12 --clouds full --inits 2`: 20 objects, weights `small`, 2 starts"
+        "`tdf benchmark --weights small --pairs 60 --seed 0 --height 0.12 --clouds full --num-starts 2`: 20 objects, weights `small`, 2 starts"
         in text
     )
     assert "{" not in text and "trajectory of 7 poses" in text
@@ -1368,14 +1388,15 @@ def test_the_record_is_json_with_every_task(many, model, extras):
     assert [(row["clouds"], row["method"]) for row in found["rows"]] == [("full", "copy"), ("full", "tdf_jax")]
     for row in found["rows"]:
         assert {name: value for name, value in row.items() if name not in ("clouds", "method")} == json.loads(
-            json.dumps(summarised(by_method(many)[row["method"]]))
+            json.dumps(summary(by_method(many)[row["method"]]))
         )
     assert len(found["tasks"]) == len(many) and found["tasks"][7]["distances"] == pytest.approx(
         many[7].distances, abs=1e-6
     )
     assert found["weights"] == {"name": "small", "source": "a test"} and found["settings"]["pairs"] == 60
     assert [one["count"] for one in found["demonstrations"]] == [1, 3] and found["reliability"]["picks"] == 60
+    assert (found["schema"], set(found["machine"])) == (3, {"jax", "backend"})
 
 
 def test_a_table_is_markdown():
-    assert markdown(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
+    assert markdown(["a", "b"], [["1", "2"]]) == "| a | b |\n|---|---|\n| 1 | 2 |"

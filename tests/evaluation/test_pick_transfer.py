@@ -11,12 +11,18 @@ from scipy.spatial import cKDTree
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.annotated_meshes import AnnotatedMesh
-from tdf_jax.evaluation.cases import mesh_case, mug_case
-from tdf_jax.evaluation.comparison import BASELINES, compare, random_weights
+from tdf_jax.evaluation.cases import QUERY_SIZE, mesh_case, mug_case
 from tdf_jax.evaluation.conditions import CONDITIONS, NOISE
 from tdf_jax.evaluation.metrics import expected_trajectory, path_error, pose_error
-from tdf_jax.evaluation.pick_transfer import QUERY_SIZE, overlaps, place_errors, transferred
-from tdf_jax.evaluation.statistics import summary
+from tdf_jax.evaluation.pick_transfer import (
+    BASELINES,
+    compare,
+    overlaps,
+    place_errors,
+    random_weights,
+    summary,
+    transferred,
+)
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.sampling import sample_surface
 
@@ -193,7 +199,7 @@ def test_a_transfer_between_objects_of_half_the_size_is_asked_with_half_the_quer
         lambda key, count, size: sizes.append(size) or tdf.box_query(key, 8, size),
     )
     cases = [mug_case(0, 0, points=40, clouds=clouds) for clouds in ("full", "half")]
-    transferred(small_model, cases, config=tdf.OptimizeConfig(inits=2, iterations=1), progress=False)
+    transferred(small_model, cases, config=tdf.OptimizeConfig(num_starts=2, iterations=1), progress=False)
     assert sizes == [QUERY_SIZE, QUERY_SIZE / 2]
 
 
@@ -201,7 +207,7 @@ def test_a_transfer_between_objects_of_half_the_size_is_asked_with_half_the_quer
 def test_every_case_and_network_runs_the_programs_of_the_first(small_model):
     """Clouds of any number of points are thinned to one; no later case compiles anything."""
     model = dataclasses.replace(small_model, info=tdf.ModelInfo("small", "a test", cloud_points=40))
-    config = tdf.OptimizeConfig(inits=2, iterations=2)
+    config = tdf.OptimizeConfig(num_starts=2, iterations=2)
     batches = [
         [mug_case(0, index, points=60, clouds=clouds)]
         for index, clouds in enumerate(("full", "half", "views1", "noise"))
@@ -224,7 +230,7 @@ def test_an_unknown_baseline_is_told_before_anything_runs():
 def test_the_shipped_weights_transfer_a_pose_and_random_ones_do_not():
     model = tdf.load_model("mug")
     cases = [mug_case(0, index) for index in range(3)]
-    config = tdf.OptimizeConfig(inits=5, iterations=60)
+    config = tdf.OptimizeConfig(num_starts=5, iterations=60)
     distance, angle = place_errors(transferred(model, cases, config=config, progress=False), cases)
     assert (distance < 0.02).all() and (angle < 20).all(), (distance, angle)
     encoded, refined = overlaps(model, cases[:1], samples=4000).values()

@@ -18,12 +18,12 @@ def test_it_keeps_what_is_done_and_tells_the_distribution(small_model, tmp_path,
         lambda name: dataclasses.replace(small_model, info=tdf.ModelInfo("small", "a test", cloud_points=40)),
     )
     monkeypatch.setattr(energies, "QUERIES", 8)
-    short = tdf.OptimizeConfig(inits=2, iterations=3)
+    short = tdf.OptimizeConfig(num_starts=2, iterations=3)
     compared, kept = [], energies.compare
 
-    def compare(model, problem, seed):
+    def compare(problem, seed):
         compared.append(problem)
-        return kept(model, (*problem[:3], short), seed)
+        return kept(problem._replace(config=short), seed)
 
     monkeypatch.setattr(energies, "compare", compare)
     words = ["--rows", "1", "--first", "3", "--out", str(tmp_path / "energies.json")]

@@ -19,7 +19,7 @@ from tdf_jax.paper.runs import Run, imitation
 from tdf_jax.paper.setting import Setting
 from tdf_jax.paper.store import Store
 
-TINY = Setting(poses=3, iterations=4, queries=8, inits=2)
+TINY = Setting(num_poses=3, iterations=4, queries=8, num_starts=2)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -38,7 +38,12 @@ def made(curve=(1.0, 0.5), found=None, expected=None, **fields):
     """A run of made-up numbers: one start."""
     found = random_poses(0, 4) if found is None else found
     expected = found if expected is None else expected
-    values = {"reference": found, "starts": found[None], "found": found[None], "losses": np.array([curve])}
+    values = {
+        "reference": found,
+        "initial_trajectories": found[None],
+        "trajectories": found[None],
+        "losses": np.array([curve]),
+    }
     values |= {
         "expected": expected,
         "path": expected[:, 4:],
@@ -110,11 +115,19 @@ def test_query_points_are_of_the_kind_and_size_asked_for():
 
 
 def test_the_optimiser_has_the_numbers_of_the_setting():
-    setting = dataclasses.replace(TINY, inits=3, iterations=7, translation_rate=0.02, start="carried", diagonal=0.2)
-    expected = tdf.OptimizeConfig(inits=3, iterations=7, translation_rate=0.02, start="carried", start_radius=0.2)
+    setting = dataclasses.replace(
+        TINY, num_starts=3, iterations=7, translation_rate=0.02, start="carried", diagonal=0.2
+    )
+    expected = tdf.OptimizeConfig(num_starts=3, iterations=7, translation_rate=0.02, start="carried", start_radius=0.2)
     assert setting.optimiser == expected
     energy = dataclasses.replace(
-        TINY, k=0.1, compensator=0.3, lever=0.2, pose_norm="metres_radians", compensator_order="infinity", unit=0.5
+        TINY,
+        k=0.1,
+        compensator=0.3,
+        rotation_scale=0.2,
+        pose_norm="metres_radians",
+        compensator_order="infinity",
+        unit=0.5,
     ).energy
     assert energy == tdf.EnergyWeights(0.2, 0.3, 0.2, "metres_radians", "infinity")
 
@@ -139,7 +152,7 @@ def test_the_correlation_term_may_pull_towards_the_stretched_demonstration(refer
     assert same is reference
     for displaced, sign in (("goal", 1), ("start", -1)):
         setting = dataclasses.replace(
-            TINY, poses=4, displacement=(0.1, 0.0, 0.3), displaced=displaced, correlated="stretched"
+            TINY, num_poses=4, displacement=(0.1, 0.0, 0.3), displaced=displaced, correlated="stretched"
         )
         moved = settings.aim(setting, reference)
         steps = np.asarray(moved.trajectory.translations - reference.trajectory.translations)
@@ -156,8 +169,8 @@ def test_the_correlation_term_may_pull_towards_the_stretched_demonstration(refer
         {"query": "cone"},
         {"start": "here"},
         {"compensator_order": "one"},
-        {"poses": 1},
-        {"inits": 0},
+        {"num_poses": 1},
+        {"num_starts": 0},
         {"seed": -1},
         {"seed": 2**32},
         {"correlated": "both"},
@@ -181,11 +194,11 @@ def test_settings_that_make_no_sense_are_refused(changes):
 
 
 def test_a_run_keeps_every_start_and_its_losses(run):
-    assert run.starts.shape == run.found.shape == (2, 3, 7)
+    assert run.initial_trajectories.shape == run.trajectories.shape == (2, 3, 7)
     assert run.losses.shape == (2, 5)
     assert run.loss == run.losses[:, -1].min()
     assert run.start_loss == run.losses[run.best, 0]
-    np.testing.assert_array_equal(run.trajectory, run.found[run.best])
+    np.testing.assert_array_equal(run.trajectory, run.trajectories[run.best])
     np.testing.assert_allclose(run.trajectory[-1], run.expected[-1], atol=1e-6)  # the goal, held
 
 
@@ -205,20 +218,20 @@ def test_a_run_is_the_optimisation_of_its_settings(small_model, run):
 
 def test_a_free_last_pose_moves_and_another_seed_is_another_experiment(small_model, run):
     free = imitation(small_model, dataclasses.replace(TINY, fix_last=False))
-    np.testing.assert_allclose(free.starts[:, -1], run.starts[:, -1])
+    np.testing.assert_allclose(free.initial_trajectories[:, -1], run.initial_trajectories[:, -1])
     assert np.abs(free.trajectory[-1] - free.expected[-1]).max() > 1e-3
     other = imitation(small_model, dataclasses.replace(TINY, seed=1))
-    assert np.abs(other.starts[:, 0] - run.starts[:, 0]).max() > 0.01
+    assert np.abs(other.initial_trajectories[:, 0] - run.initial_trajectories[:, 0]).max() > 0.01
 
 
 def test_a_displaced_goal_moves_no_other_pose_unless_the_demonstration_is_stretched(small_model, run):
     """Each pose has terms of its own only, and the last is held: docs/results/paper.md says so."""
     displaced = dataclasses.replace(TINY, displacement=(-0.2, 0.1, 0.3))
     moved = imitation(small_model, displaced)
-    np.testing.assert_array_equal(moved.found[:, :-1], run.found[:, :-1])
-    np.testing.assert_allclose(moved.found[0, -1, 4:] - run.found[0, -1, 4:], (-0.2, 0.1, 0.3), atol=1e-6)
+    np.testing.assert_array_equal(moved.trajectories[:, :-1], run.trajectories[:, :-1])
+    np.testing.assert_allclose(moved.trajectories[0, -1, 4:] - run.trajectories[0, -1, 4:], (-0.2, 0.1, 0.3), atol=1e-6)
     stretched = imitation(small_model, dataclasses.replace(displaced, correlated="stretched"))
-    assert np.abs(stretched.found[:, 1] - run.found[:, 1]).max() > 1e-4
+    assert np.abs(stretched.trajectories[:, 1] - run.trajectories[:, 1]).max() > 1e-4
 
 
 def test_the_loss_has_settled_when_95_percent_of_its_drop_are_made_for_good():
@@ -292,16 +305,16 @@ def test_what_was_computed_is_kept(small_model, run, tmp_path, monkeypatch):
 
 
 def test_the_table_has_the_papers_nine_rows_over_the_seeds_and_the_variations():
-    plan = table.planned(dataclasses.replace(TINY, poses=7), 2)
+    plan = table.planned(dataclasses.replace(TINY, num_poses=7), 2)
     rows = [settings for group, settings in plan if group == "table 1"]
     assert [(one.trajectory, one.displacement) for one, _ in rows] == list(table.PAPER)
     assert [setting.seed for setting in rows[0]] == [0, 1]
     assert len(plan) == 9 + 3 * len(table.VARIATIONS)
     first = {group: settings[0] for group, settings in reversed(plan)}
-    assert [first[f"n = {n}"].poses for n in (3, 5, 13, 25)] == [3, 5, 13, 25]
+    assert [first[f"n = {n}"].num_poses for n in (3, 5, 13, 25)] == [3, 5, 13, 25]
     assert [first[f"k = {k}"].k for k in ("0", "0.002", "0.2")] == [0.0, 0.002, 0.2]
     assert first["last pose free"].fix_last is False and first["nothing"] == dataclasses.replace(
-        TINY, poses=7, trajectory="line"
+        TINY, num_poses=7, trajectory="line"
     )
     assert first["l_p for l_c, infinity"].energy.compensator_order == "infinity"
     # Every variation but the first changes something, and no two are the same.
@@ -352,7 +365,7 @@ def test_rows_are_means_over_seeds():
 
 def test_tables_show_the_papers_numbers_beside_ours_and_every_variation():
     plan = table.planned(TINY, 1, ("k = 0", "n = 3"))
-    rows = table.rows(lambda setting: made((1.0, 0.001 * setting.poses)), plan)
+    rows = table.rows(lambda setting: made((1.0, 0.001 * setting.num_poses)), plan)
     lines = table.as_markdown(rows).splitlines()
     assert sum(line.startswith(("| line", "| semicircle", "| wave")) for line in lines) == 9
     assert "| line | (0, 0, 0) | 0.0068 | 0.0030 |" in "\n".join(lines)

@@ -1,8 +1,9 @@
-"""What imitates a task: the library, the paper's energy, and baselines from copying to an oracle.
+"""Methods that imitate a whole trajectory: the library, the paper's energy, and baselines from a copy to an oracle.
 
-A method's rows are its starts (of the solver: the candidates it ends with), each a whole trajectory that ends at the
-goal, with a score that its best is chosen by. Methods that find one motion of the object carry the demonstration as the
-library does (`tdf_jax.geometry.transport.carry_trajectory`), unless their name says otherwise.
+Each method returns one trajectory for every start (for every final candidate, in the case of the solvers). All of them
+end at the goal, and each has a score by which the method selects the best. Methods that estimate one motion of the
+object warp the demonstration as the library does (`tdf_jax.geometry.transport.carry_trajectory`), unless their name
+says otherwise.
 """
 
 import dataclasses
@@ -17,9 +18,9 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference, describe
-from tdf_jax.evaluation.baselines import principal_axes, rigid_motion, settled_points
-from tdf_jax.evaluation.comparison import random_weights
+from tdf_jax.evaluation.baselines import every_registration, principal_axes, rigid_motion
 from tdf_jax.evaluation.path_tasks import Task, carried_by
+from tdf_jax.evaluation.pick_transfer import random_weights
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.geometry.transport import carry_to_picks
@@ -33,33 +34,35 @@ from tdf_jax.solvers.pick import carry
 from tdf_jax.solvers.result import Result
 
 LIBRARY = "tdf_jax"
-NEAR = 0.04  # metres from the pick within which the oracle's correspondences count
-MANY = 64  # starts of the baselines that are tried with as many as the library's solver scouts from
-# eq. 3; the paper leaves the norm open, and all but the plain one are with the library's lever, which helps it
+NEAR = 0.04  # metres from the pick within which the oracle uses correspondences
+MANY = 64  # starts of the baselines that take as many as the library's solver begins with
+# The paper leaves the norm of eq. 3 open. All but the plain norm use the library's rotation scale, which helps it.
 PAPER = {
     "TDF, k = 0": EnergyWeights(0.0),
     "TDF, k = 0.02": EnergyWeights(0.02),
     "TDF, k = 0.2": EnergyWeights(0.2),
-    "TDF, k = 0.02, plain norm": EnergyWeights(0.02, lever=1.0),
+    "TDF, k = 0.02, plain norm": EnergyWeights(0.02, rotation_scale=1.0),
 }
-ABOUT_CARRIED = {  # the same about the carried demonstration instead of the one in the world
+# The correlation term compares with the warped demonstration instead of the demonstration in the world.
+ABOUT_CARRIED = {
     "TDF about the carried path, k = 0.02": EnergyWeights(0.02),
     "TDF about the carried path, k = 0.2": EnergyWeights(0.2),
 }
 COMPENSATED = "TDF, l_p"
-COMPENSATOR = EnergyWeights(0.0, compensator=0.02)  # the paper gives no weight: that of the term it was to replace
+# The paper gives no weight of eq. 6; this is the weight of the term that eq. 6 was to replace.
+COMPENSATOR = EnergyWeights(0.0, compensator=0.02)
 STREAM = 0xBE9C4  # folded into the key of starts
 
 
 @dataclasses.dataclass(frozen=True)
 class Attempt:
-    """What a method came to on a task.
+    """Result of a method on a task.
 
     Attributes:
-        trajectories: of every start, T_world_query, (starts, poses, 7).
-        scores: the lower the better, (starts,).
-        seconds: of one imitation, encoding included.
-        residual: see `tdf_jax.confidence`, NaN where the method has none.
+        trajectories: T_world_query of every start, (starts, poses, 7).
+        scores: score of every start, (starts,); lower is better.
+        seconds: time of one imitation, encoding included.
+        residual: residual of the pick, see `tdf_jax.confidence`; NaN where the method has none.
     """
 
     trajectories: Float[np.ndarray, "starts poses 7"]
@@ -69,7 +72,7 @@ class Attempt:
 
     @property
     def best(self) -> int:
-        """The start that is chosen; where none is finite, the first."""
+        """The selected start: the one with the lowest score; the first if none is finite."""
         return int(np.argmin(np.where(self.finite, self.scores, np.inf)))
 
     @property
@@ -80,26 +83,26 @@ class Attempt:
 
 @dataclasses.dataclass(frozen=True)
 class _Encoded:
-    """A task as a network sees it, the seconds that this took, and NDF's picks, which several methods share."""
+    """A task as a network encodes it, the time of encoding, and the picks of NDF, which several methods share."""
 
     field: DescriptorField
     reference: Reference
     seconds: float
-    picks: dict  # by number of starts
+    picks: dict  # the number of starts is the key
 
 
 class Attempts:
-    """What methods come to on one task, which is encoded once, when the first of them asks.
+    """Attempts of methods on one task, which is encoded once, when the first method needs it.
 
     Args:
-        task: what to imitate.
+        task: the task.
         model: the network.
-        key: random key of the benchmark; the starts of a task are a function of it and the task's index.
-        inits: random starts.
+        key: random key of the benchmark; the starts of a task depend on it and on the task's index alone.
+        num_starts: number of random starts.
     """
 
-    def __init__(self, task: Task, model: Model, key: PRNGKeyArray, inits: int):
-        self.task, self.model, self.inits = task, model, inits
+    def __init__(self, task: Task, model: Model, key: PRNGKeyArray, num_starts: int):
+        self.task, self.model, self.num_starts = task, model, num_starts
         self.key = jax.random.fold_in(jax.random.fold_in(key, STREAM), task.index)
 
     @functools.cached_property
@@ -107,9 +110,9 @@ class Attempts:
         return _encoded(self.task, self.model)
 
     def of(self, method: str) -> Attempt | None:
-        """The attempt of one of `METHODS`; None where it cannot be tried, such as the oracle on a mesh without correspondences."""
+        """The attempt of one of `METHODS`; None if it cannot run, such as the oracle on a mesh without correspondences."""
         encoded = self._encoded if method in NETWORKS else None
-        return METHODS[method](self.task, self.model, encoded, self.key, self.inits)
+        return METHODS[method](self.task, self.model, encoded, self.key, self.num_starts)
 
 
 def _encoded(task, model) -> _Encoded:
@@ -139,15 +142,15 @@ def _principal_axes(task, *_) -> Attempt:
     return _carried(task, carried_by(task, T_b_a)[None], np.zeros(1), time.perf_counter() - began)
 
 
-def _closest_points(task, model, encoded, key, inits) -> Attempt:
-    rotations = np.asarray(se3.uniform_rotations(key, inits), float)
+def _closest_points(task, model, encoded, key, num_starts) -> Attempt:
+    rotations = np.asarray(se3.uniform_rotations(key, num_starts), float)
     began = time.perf_counter()
-    motions, costs = settled_points(task.case.points_a, task.case.points_b, rotations)
+    motions, costs = every_registration(task.case.points_a, task.case.points_b, rotations)
     return _carried(task, carried_by(task, motions), costs, time.perf_counter() - began)
 
 
 def _oracle(task, *_) -> Attempt | None:
-    """The rigid motion of least squares between points that are known to correspond, near the pick."""
+    """The rigid motion that fits corresponding points near the pick best, by least squares."""
     case = task.case
     if not isinstance(case.object_b, Mug):
         return None
@@ -157,9 +160,9 @@ def _oracle(task, *_) -> Attempt | None:
     return _carried(task, carried_by(task, T_b_a)[None], np.zeros(1), 0.0)
 
 
-def _descriptor_fields(task, model, encoded, key, inits, *, rigidly=False) -> Attempt:
-    """NDF: one pose by Adam at the pick."""
-    if inits not in encoded.picks:
+def _descriptor_fields(task, model, encoded, key, num_starts, *, rigidly=False) -> Attempt:
+    """NDF: Adam optimises the pick alone."""
+    if num_starts not in encoded.picks:
         picked = Reference(
             encoded.reference.descriptors[:1],
             Trajectory(encoded.reference.trajectory.wxyz_xyz[:1]),
@@ -167,12 +170,17 @@ def _descriptor_fields(task, model, encoded, key, inits, *, rigidly=False) -> At
         )
         began = time.perf_counter()
         result = optimize(
-            encoded.field, picked, key, fix_last=False, energy=EnergyWeights(0.0), config=OptimizeConfig(inits=inits)
+            encoded.field,
+            picked,
+            key,
+            fix_last=False,
+            energy=EnergyWeights(0.0),
+            config=OptimizeConfig(num_starts=num_starts),
         )
         jax.block_until_ready(result)
         seconds = time.perf_counter() - began + encoded.seconds
-        encoded.picks[inits] = np.asarray(result.trajectories[:, 0]), np.asarray(result.energies), seconds
-    return _carried(task, *encoded.picks[inits], rigidly=rigidly)
+        encoded.picks[num_starts] = np.asarray(result.trajectories[:, 0]), np.asarray(result.energies), seconds
+    return _carried(task, *encoded.picks[num_starts], rigidly=rigidly)
 
 
 def _replay(*arguments) -> Attempt:
@@ -181,22 +189,22 @@ def _replay(*arguments) -> Attempt:
 
 def _with_many(method: Callable) -> Callable:
     """A method with `MANY` starts."""
-    return lambda task, model, encoded, key, inits: method(task, model, encoded, key, MANY)
+    return lambda task, model, encoded, key, num_starts: method(task, model, encoded, key, MANY)
 
 
-def _untrained(task, model, encoded, key, inits) -> Attempt:
-    return _descriptor_fields(task, model, _encoded(task, random_weights(model, 0)), key, inits)
+def _untrained(task, model, encoded, key, num_starts) -> Attempt:
+    return _descriptor_fields(task, model, _encoded(task, random_weights(model, 0)), key, num_starts)
 
 
-def _library(task, model, encoded, key, inits) -> Attempt:
+def _library(task, model, encoded, key, num_starts) -> Attempt:
     return _timed(encoded, lambda: carry(encoded.field, encoded.reference, key, goal=jnp.asarray(task.goal)))
 
 
 def _paper(energy: EnergyWeights) -> Callable:
-    """Eq. 3 over all waypoints. Its solver takes more starts of one waypoint and finds lower energies than Adam from as many starts."""
+    """Eq. 3 over all waypoints, minimised by `solve`, which reaches lower energies than Adam from as many starts."""
 
-    def method(task, model, encoded, key, inits):
-        goal, config = jnp.asarray(task.goal), SolveConfig(inits=inits)
+    def method(task, model, encoded, key, num_starts):
+        goal, config = jnp.asarray(task.goal), SolveConfig(num_trajectory_starts=num_starts)
         return _timed(
             encoded, lambda: solve(encoded.field, encoded.reference, key, goal=goal, energy=energy, config=config)
         )
@@ -205,23 +213,28 @@ def _paper(energy: EnergyWeights) -> Callable:
 
 
 def _about_carried(energy: EnergyWeights) -> Callable:
-    """Eq. 3 whose correlation term is to the demonstration as the library carries it; descriptors still pull every waypoint."""
+    """Eq. 3 whose correlation term compares with the demonstration as the library warps it.
 
-    def method(task, model, encoded, key, inits):
+    The descriptor term still acts on every waypoint.
+    """
+
+    def method(task, model, encoded, key, num_starts):
         def run():
             goal, field = jnp.asarray(task.goal), encoded.field
             carried = carry(field, encoded.reference, key, goal=goal).trajectory.shifted(-field.origin)
             reference = dataclasses.replace(encoded.reference, trajectory=carried)
-            return solve(field, reference, key, goal=goal, energy=energy, config=SolveConfig(inits=inits))
+            return solve(
+                field, reference, key, goal=goal, energy=energy, config=SolveConfig(num_trajectory_starts=num_starts)
+            )
 
         return _timed(encoded, run)
 
     return method
 
 
-def _compensated(task, model, encoded, key, inits) -> Attempt:
-    """Eq. 6 couples the waypoints: Adam."""
-    goal, config = jnp.asarray(task.goal), OptimizeConfig(inits=inits)
+def _compensated(task, model, encoded, key, num_starts) -> Attempt:
+    """Eq. 6 couples the waypoints, so Adam minimises it."""
+    goal, config = jnp.asarray(task.goal), OptimizeConfig(num_starts=num_starts)
     return _timed(
         encoded, lambda: optimize(encoded.field, encoded.reference, key, goal=goal, energy=COMPENSATOR, config=config)
     )
@@ -243,10 +256,10 @@ METHODS: dict[str, Callable] = {
     LIBRARY: _library,
     "oracle correspondences": _oracle,
 }
-# those that use the network's descriptors
+# Methods that use the network's descriptors.
 NETWORKS = (*(name for name in METHODS if name.startswith("NDF")), *PAPER, COMPENSATED, *ABOUT_CARRIED, LIBRARY)
-# Variants are tried on every fifth task, which are of all paths with all goals too: all of them would take as long as
-# the rest together.
+# Variants run on every fifth task, because on all tasks they would take as long as all other methods together. Every
+# fifth task still covers all paths with all goals.
 VARIANTS = (
     *(name for name in METHODS if f"{MANY} starts" in name),
     "random weights",
@@ -258,7 +271,7 @@ EVERY = 5
 
 
 def tried(method: str, index: int) -> bool:
-    """Whether a method is tried on a task."""
+    """Whether a method runs on the task of an index."""
     return method not in VARIANTS or index % EVERY == 0
 
 
@@ -266,8 +279,8 @@ def _timed(encoded, run: Callable[[], Result]) -> Attempt:
     began = time.perf_counter()
     result = jax.block_until_ready(run())
     seconds = time.perf_counter() - began + encoded.seconds
-    left = float("nan") if result.residual is None else result.residual
-    return Attempt(np.asarray(result.trajectories), np.asarray(result.energies), seconds, left)
+    residual = float(result.residual)
+    return Attempt(np.asarray(result.trajectories), np.asarray(result.energies), seconds, residual)
 
 
 def _carried(task, picks, scores, seconds, *, rigidly=False) -> Attempt:
