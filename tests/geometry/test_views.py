@@ -98,5 +98,5 @@ def test_views_refuse_bad_input():
     with pytest.raises(InputError, match="in one plane"):
         single_view(points * [1, 1, 0], np.array([4.0, 0, 0]))
     for bad_points, cameras in [(points[:, :2], np.eye(3)), (points, np.eye(2)), (points, np.zeros((0, 3)))]:
-        with pytest.raises(InputError, match="expected \\(points, 3\\) and \\(cameras, 3\\)"):
+        with pytest.raises(InputError, match="(points|cameras) has shape"):
             merge_views(bad_points, cameras)
