@@ -1,6 +1,6 @@
-"""Meshes of real objects with what an evaluation must know of them: their unit, their axes and their semantic places.
+"""Meshes of real objects with annotations: their unit, their axes and their semantic places.
 
-A folder of meshes holds one `meshes.json`, an object with an entry for each mesh to use:
+A folder of meshes has a file `meshes.json`, an object with an entry for each mesh:
 
     {"mug.obj": {"unit": 0.01, "up": "+y", "handle": "+x"},
      "cup.stl": {"unit": 1, "up": "+z", "handle": "-y", "places": {"handle": [[1, 0, 0, 0.06], ..., [0, 0, 0, 1]]}},
@@ -8,10 +8,10 @@ A folder of meshes holds one `meshes.json`, an object with an entry for each mes
      "mustard.obj": {"category": "bottle", "unit": 1, "up": "+z", "symmetry": "two-fold", "front": "+x"}}
 
 `unit` is metres per unit of the file; `up` and `handle` are axes of the file. Bowls and bottles have a `symmetry`, one
-of `tdf_jax.geometry.symmetry.FOLDS`, and, unless they are round, a `front`: the axis of the file, or a direction [x, y,
-z] in it, along their longer side or to their handle. `places` are frames T_object_place, 4x4 in metres, in the
-canonical frame (z up, the handle or front along +x, the origin on the body's axis at mid height); those not given are
-measured.
+of `tdf_jax.geometry.symmetry.FOLDS`. Unless they are round, they also have a `front`: an axis of the file, or a
+direction [x, y, z] in it, along their longer side or to their handle. `places` are frames T_object_place, 4x4, metres,
+in the canonical frame (z up, the handle or front along +x, the origin on the body's axis at mid height). Places that
+are not given are measured.
 """
 
 import dataclasses
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     import trimesh
 
 SIDECAR = "meshes.json"
-DIAGONALS = (0.03, 1.0)  # metres; beyond them the unit is more likely wrong than the object a thing to be held
+DIAGONALS = (0.03, 1.0)  # metres; another diagonal means that the unit is probably wrong
 UNITS = (1.0, 0.01, 0.001, 0.0254)  # metres, centimetres, millimetres, inches
-OFF_FRONT = 10.0  # degrees: how far from `front` a longer side may lie
+OFF_FRONT = 10.0  # degrees, the largest angle between `front` and the longer side
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -44,12 +44,12 @@ class AnnotatedMesh:
     """A mesh in its canonical frame, with its semantic places.
 
     Attributes:
-        name: of its file, without the ending.
-        mesh: metres.
-        height: of the body, metres.
-        frames: T_object_place, 4x4, by name.
-        category: what it is.
-        fold: its symmetry about z, see `tdf_jax.symmetry`.
+        name: name of its file, without the suffix.
+        mesh: the mesh, metres, canonical frame.
+        height: height of the body, metres.
+        frames: T_object_place, 4x4, by the name of the place.
+        category: category of the object.
+        fold: symmetry about z, see `tdf_jax.geometry.symmetry`.
     """
 
     name: str
@@ -60,7 +60,11 @@ class AnnotatedMesh:
     fold: int = 1
 
     def contains(self, points: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, " points"] | None:
-        """Which points, (points, 3), metres, canonical frame, lie in the clay; None for an open surface."""
+        """Which points lie inside the solid; None for an open surface.
+
+        Args:
+            points: points, (points, 3), metres, canonical frame.
+        """
         return inside(self.mesh, points)
 
     def scaled(self, factor: float) -> "AnnotatedMesh":
@@ -74,7 +78,10 @@ class AnnotatedMesh:
 
 
 def load_annotated(folder: str | Path) -> list[AnnotatedMesh]:
-    """Read the meshes that a folder's `meshes.json` names, in the order of their names.
+    """Read the meshes that `meshes.json` of a folder names, in the order of their names.
+
+    Args:
+        folder: the folder.
 
     Raises:
         InputError: the folder or the sidecar is missing, an entry is malformed or names a mesh that cannot be used, or
@@ -86,11 +93,12 @@ def load_annotated(folder: str | Path) -> list[AnnotatedMesh]:
 
 
 def _sidecar(folder: Path) -> dict:
-    """The entries by file name, of the right shape but not yet checked in themselves."""
+    """The entries by file name; their content is not checked yet."""
     path, expected = folder / SIDECAR, 'expected {"mug.obj": {"unit": 1, "up": "+z", "handle": "+x"}, ...}'
     if not folder.is_dir():
         raise InputError(
-            f"load_annotated(): there is no folder {folder}; expected one with meshes and their {SIDECAR}; check the path"
+            f"load_annotated(): there is no folder {folder}; expected one with meshes and their {SIDECAR}; check the "
+            "path"
         )
     if not any(folder.iterdir()):
         raise InputError(
@@ -110,19 +118,21 @@ def _sidecar(folder: Path) -> dict:
     )
     if unnamed:
         raise InputError(
-            f"load_annotated(): {path} has no entry for {', '.join(unnamed)}; expected one for each mesh; add it or move the file away"
+            f"load_annotated(): {path} has no entry for {', '.join(unnamed)}; expected one for each mesh; add it or "
+            "move the file away"
         )
     stems = [Path(name).stem for name in entries]
     twice = sorted({stem for stem in stems if stems.count(stem) > 1})
     if twice:
         raise InputError(
-            f"load_annotated(): {path} has several meshes called {', '.join(twice)}; expected different names; rename one"
+            f"load_annotated(): {path} has several meshes called {', '.join(twice)}; expected different names; "
+            "rename one"
         )
     return entries
 
 
 class _Entry(NamedTuple):
-    """What the sidecar says of a mesh."""
+    """Annotations of a mesh in the sidecar."""
 
     category: str
     fold: int
@@ -183,7 +193,7 @@ def _checked(path: Path, entry) -> _Entry:
 
 
 def _wanted(category: str, has_front: bool) -> str:
-    """The keys of an entry, for messages."""
+    """The keys of an entry in words, for messages."""
     if category == "mug":
         return "unit, up, handle and, if known, places"
     return f"category, unit, up, symmetry{', front' if has_front else ''} and, if known, places"
@@ -194,7 +204,9 @@ def _axes(entry: dict, category: str, refuse) -> np.ndarray:
     side, up = "handle" if category == "mug" else "front", entry["up"]
     if not isinstance(up, str) or up not in AXES:
         refuse(f"up is {up!r}", f"one of {', '.join(AXES)}")
-    front = entry.get(side, next(axis for axis in AXES if not AXES[axis] @ AXES[up]))  # of a round object any
+    front = entry.get(
+        side, next(axis for axis in AXES if not AXES[axis] @ AXES[up])
+    )  # any front is right for a round object
     if category != "mug" and isinstance(front, list):
         return _axes_of(up, front, refuse)
     if not isinstance(front, str) or front not in AXES:
@@ -208,7 +220,7 @@ def _axes(entry: dict, category: str, refuse) -> np.ndarray:
 
 
 def _axes_of(up: str, front: list, refuse) -> np.ndarray:
-    """R_file_object for a front that is no axis of the file."""
+    """R_file_object for a front that is not an axis of the file."""
     try:
         x, z = np.array(front, float), AXES[up]
     except (TypeError, ValueError):
@@ -224,13 +236,13 @@ def _given_places(entry: dict, category: str, refuse) -> dict:
     places, names = entry.get("places", {}), FAMILIES[category].places
     if not isinstance(places, dict) or not set(places) <= set(names):
         refuse(f"places is {places!r}", f"an object with any of {', '.join(names)}")
-    return {
-        name: _place(place, lambda got: refuse(f"the place {name} {got}", "a 4x4 matrix, a rotation and metres"))
-        for name, place in places.items()
-    }
+    return {name: _place(name, place, refuse) for name, place in places.items()}
 
 
-def _place(value, refuse) -> np.ndarray:
+def _place(name: str, value, refuse_entry) -> np.ndarray:
+    def refuse(got):
+        refuse_entry(f"the place {name} {got}", "a 4x4 matrix, a rotation and metres")
+
     try:
         T = np.array(value, float)
     except (TypeError, ValueError):
@@ -244,13 +256,14 @@ def _place(value, refuse) -> np.ndarray:
 
 
 def _check_front(path: Path, fold: int, R_file_object: np.ndarray, turned: float) -> None:
-    """Raise InputError where a front is off the side that it is along: all poses of the places would be turned with it."""
+    """Raise InputError if the front is not along a side, because all places would then be rotated too."""
     if abs(np.degrees(turned)) <= OFF_FRONT:
         return
     better = R_file_object @ [np.cos(turned), np.sin(turned), 0.0]
     raise InputError(
-        f"load_annotated(): {path.name} has its {'longer' if fold == 2 else 'flat'} side {np.degrees(abs(turned)):.0f} degrees from 'front'; expected "
-        f'{OFF_FRONT:g} at most; correct it in {SIDECAR}: "front": [{", ".join(f"{number + 0.0:.3f}" for number in better)}]'
+        f"load_annotated(): {path.name} has its {'longer' if fold == 2 else 'flat'} side "
+        f"{np.degrees(abs(turned)):.0f} degrees from 'front'; expected {OFF_FRONT:g} at most; correct it in {SIDECAR}: "
+        f'"front": [{", ".join(f"{number + 0.0:.3f}" for number in better)}]'
     )
 
 
@@ -262,8 +275,8 @@ def _check_size(path: Path, mesh, unit: float) -> None:
     likely = [other for other in UNITS if low <= diagonal / unit * other <= high]
     hint = f"; try {' or '.join(f'{other:g}' for other in likely)}" if likely else ""
     raise InputError(
-        f"load_annotated(): {path.name} has a diagonal of {diagonal:.4g} m with unit {unit:g}; expected {low:g} to {high:g} m; "
-        f"correct its unit in {SIDECAR}{hint}"
+        f"load_annotated(): {path.name} has a diagonal of {diagonal:.4g} m with unit {unit:g}; expected {low:g} to "
+        f"{high:g} m; correct its unit in {SIDECAR}{hint}"
     )
 
 

@@ -1,8 +1,8 @@
 """Semantic places of bowls' and bottles' meshes, measured on sections through their axis.
 
-They are those of `tdf_jax.shapes.Bowl` and `tdf_jax.shapes.Bottle`: the canonical frame's origin on the axis at half
-the height, z up, the front along +x, and frames T_object_place of a bowl's rim, base and body and of a bottle's neck,
-base and body. Surfaces may be open: nothing is asked of the inside.
+Frames are as in `tdf_jax.shapes.Bowl` and `tdf_jax.shapes.Bottle`: the origin of the canonical frame is on the axis at
+half the height, z points up and the front along +x. T_object_place are frames of a bowl's rim, base and body and of a
+bottle's neck, base and body. The mesh may be open, because no measurement needs its inside.
 """
 
 import dataclasses
@@ -20,34 +20,36 @@ if TYPE_CHECKING:
     import trimesh
 
 DIRECTIONS = 48  # half planes about the axis, a multiple of 8
-LEVELS = 400  # 0.5 mm apart on a common bottle
+LEVELS = 400  # horizontal levels; they are 0.5 mm apart on a common bottle
 AXIS_LEVELS = 50
-# Where the middle of an object without symmetry is its axis, shares of the height: a bottle's cap is above all handles,
-# a bowl's lower half below all spouts.
+# Shares of the height between which the middle of an object without symmetry is its axis: the cap of a bottle is above
+# all handles, and the lower half of a bowl below all spouts.
 AXIS_FROM = {"bowl": (0.1, 0.5), "bottle": (0.9, 1.0)}
-TURNS = {ROUND: (1 / 8, 1 / 4), 2: (1 / 2,), 4: (1 / 4,)}  # of a full one, that leave an outline as it is
-CHANGE = 0.15  # of the radius: by how much a turn may change it still
-LEAST_FRONT = 0.9  # of the reach to the other sides: less of a reach is not to the front
-SHAPELESS = 0.02  # strength of an outline's harmonic below which it has no direction: an ellipse 4 % longer than wide
-NARROWER = 0.9  # of the body's radius: the widest neck that is one
-CURVES = np.linspace(1.0, 3.0, 17)  # of the shoulders tried, `BottleParameters.shoulder_curve`
-# of the height of the shoulder's middle: where it may begin; lower, barrels are taken for shoulders
+TURNS = {ROUND: (1 / 8, 1 / 4), 2: (1 / 2,), 4: (1 / 4,)}  # shares of a full turn that keep an outline of a symmetry
+CHANGE = 0.15  # share of the radius: largest change of the outline by such a turn
+LEAST_FRONT = 0.9  # smallest reach to the front over the reach to the other sides
+# Strength of the harmonic of an outline below which it has no direction; an ellipse 4 % longer than wide has it.
+SHAPELESS = 0.02
+NARROWER = 0.9  # radius of the widest neck over that of the body
+CURVES = np.linspace(1.0, 3.0, 17)  # values of `BottleParameters.shoulder_curve` that are fitted
+# Lowest start of a shoulder over the height of its middle. With a lower start, barrels would count as shoulders.
 LOWEST_SHOULDER = 0.5
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Profile:
-    """How far an object reaches from its axis.
+    """The surface of an object as distances from its axis.
 
     Attributes:
-        origin: on the axis at half the height, in the frame it was measured in, (3,), metres.
-        height: metres.
-        sections: for each direction, evenly about the axis from +x on, the surface in the plane through the axis:
-            segments (segments, 2, 2) of (distance from the axis that way, height above the origin), metres.
-        radii: the outermost surface by level, upwards, and direction, metres; a hole is as wide as what is above and
-            below it, NaN if it is all of the height.
-        turned: from +x to the longer side, or to the nearest flat side of a square, radians; 0 where symmetry or shape
-            tell of none.
+        origin: point on the axis at half the height, (3,), metres, frame of the mesh.
+        height: height, metres.
+        sections: for each direction, evenly spaced about the axis from +x on, the surface in the plane through the
+            axis: segments, (segments, 2, 2), of (distance from the axis in that direction, height above the origin),
+            metres.
+        radii: distance of the outermost surface, (levels, directions), metres; levels rise. Holes are interpolated, and
+            a direction without any surface is NaN.
+        turned: angle from +x to the longer side, or to the nearest flat side of a square, radians; 0 if the symmetry or
+            the shape has no such side.
     """
 
     origin: Float[np.ndarray, "3"]
@@ -58,20 +60,21 @@ class Profile:
 
 
 def profile(mesh: "trimesh.Trimesh", category: str, fold: int, name: str) -> Profile:
-    """Find the axis of a bowl or bottle whose front points along +x, z up, and measure it from there.
+    """Measure the axis and the profile of a bowl or bottle whose front points along +x, z up.
 
     Args:
-        mesh: metres.
+        mesh: the mesh, metres.
         category: "bowl" or "bottle".
-        fold: its symmetry, see `tdf_jax.symmetry`.
-        name: of the mesh, for messages.
+        fold: symmetry of the object, see `tdf_jax.geometry.symmetry`.
+        name: name of the mesh, for messages.
 
     Raises:
-        InputError: the mesh does not have this symmetry about z, or reaches out on another side than its front.
+        InputError: the mesh does not have this symmetry about z, or reaches farther to another side than to its front.
     """
     axis = np.append(_axis(mesh, AXIS_FROM[category] if fold == 1 else (0.0, 1.0), name), mesh.bounds[0, 2])
     sections = _sections(mesh, axis)
-    # Of the highest point in each direction the median: the rim of a scan leans, and stray vertices must not raise it.
+    # The height is the median of the highest points of all directions, because the rim of a scan leans, and because
+    # stray vertices must not raise it.
     tops = [section[(section[..., 0] > 0).any(axis=1), :, 1].max(initial=-np.inf) for section in sections]
     height = float(np.median([top for top in tops if top > -np.inf]))
     sections = tuple(section - [0.0, height / 2] for section in sections)
@@ -79,8 +82,8 @@ def profile(mesh: "trimesh.Trimesh", category: str, fold: int, name: str) -> Pro
     missing = int(np.isnan(radii[0]).sum())
     if missing > DIRECTIONS / 4:
         raise InputError(
-            f"profile(): {name} has no surface in {missing} of {DIRECTIONS} directions from its middle; expected one about its axis; repair the mesh, "
-            "or correct its 'up'"
+            f"profile(): {name} has no surface in {missing} of {DIRECTIONS} directions from its middle; expected one "
+            "about its axis; repair the mesh, or correct its 'up'"
         )
     origin = axis + [0.0, 0.0, height / 2]
     around = _outline(radii)
@@ -94,18 +97,17 @@ def profile_places(
     """Frames of the places of a bowl or bottle.
 
     Args:
-        found: the mesh's profile.
+        found: profile of the mesh.
         category: "bowl" or "bottle".
-        fold: its symmetry, see `tdf_jax.symmetry`.
-        name: of the mesh, for messages.
-        places: those to measure, of its family's.
+        fold: symmetry of the object, see `tdf_jax.geometry.symmetry`.
+        name: name of the mesh, for messages.
+        places: places to measure, of those of its category.
 
     Returns:
         T_object_place, 4x4, metres, by the names of `tdf_jax.shapes.FAMILIES`.
 
     Raises:
-        InputError: the mesh is not an open bowl with a wall, or not a bottle with a neck on a body, where a place to be
-            measured needs it.
+        InputError: a place needs an open bowl with a wall, or a bottle with a neck on a body, and the mesh is none.
     """
     half = found.height / 2
     frames = {"base": frame(0.0, -half)}
@@ -124,7 +126,7 @@ def _levels(height: float) -> np.ndarray:
 
 
 def _axis(mesh, shares: tuple[float, float], name: str) -> np.ndarray:
-    """Where the axis is, (x, y): the middle of the extents across of horizontal sections, the median over those at these shares of the height."""
+    """The axis, (x, y): the median of the middles of horizontal sections between two shares of the height."""
     from trimesh.intersections import mesh_plane
 
     low, high = mesh.bounds[:, 2]
@@ -132,33 +134,36 @@ def _axis(mesh, shares: tuple[float, float], name: str) -> np.ndarray:
     cuts = (
         mesh_plane(mesh, plane_normal=[0, 0, 1], plane_origin=[0, 0, level])[..., :2].reshape(-1, 2) for level in levels
     )
-    # The middle of an outline is its axis for every symmetry, while the mean of its points follows how densely a side
-    # was scanned; the middle of the whole box is thrown off by one stray vertex, and of a scanned bowl by 0.4 mm by its
-    # leaning rim.
+    # The middle of an outline is its axis for every symmetry. The mean of its points depends on how densely each side
+    # was scanned, and the middle of the whole bounding box depends on stray vertices and on a leaning rim.
     middles = [(cut.min(axis=0) + cut.max(axis=0)) / 2 for cut in cuts if len(cut)]
     if not middles:
         raise InputError(
-            f"profile(): {name} has no surface from {100 * shares[0]:.0f} to {100 * shares[1]:.0f} % of its height, where its axis is found; "
-            "expected one; repair the mesh, or correct its 'up'"
+            f"profile(): {name} has no surface from {100 * shares[0]:.0f} to {100 * shares[1]:.0f} % of its height, where "
+            "its axis is measured; expected one; repair the mesh, or correct its 'up'"
         )
     return np.median(middles, axis=0)
 
 
 def _sections(mesh, axis: np.ndarray) -> list[np.ndarray]:
-    """The surface in the plane of each direction, both sides of the axis, from a point on it."""
+    """The surface in the half plane of each direction; coordinates are relative to a point on the axis."""
     from trimesh.intersections import mesh_plane
 
     there = []
     for angle in np.arange(DIRECTIONS // 2) * (2 * np.pi / DIRECTIONS):
         along, across = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([-np.sin(angle), np.cos(angle), 0.0])
-        # Beside the axis by less than any mesh is accurate: vertices lie in these planes themselves, often whole edges.
+        # The plane is moved by less than the accuracy of any mesh, because vertices, and often whole edges, lie in
+        # planes through the axis.
         cut = mesh_plane(mesh, plane_normal=across, plane_origin=axis + 1e-6 * across) - axis
         there.append(np.stack([cut @ along, cut[..., 2]], axis=-1))
     return there + [section * [-1.0, 1.0] for section in there]
 
 
 def _outermost(section: np.ndarray, levels: np.ndarray) -> np.ndarray:
-    """The greatest first coordinate at each level of the second, from its neighbours where none is positive; NaN if none is at any."""
+    """The largest first coordinate at each level of the second coordinate.
+
+    A level without a positive one is interpolated from its neighbours. All are NaN if no level has one.
+    """
     first, last = (np.searchsorted(levels, end) for end in (section[..., 1].min(axis=1), section[..., 1].max(axis=1)))
     segment = np.repeat(np.arange(len(section)), last - first)
     level = np.arange(len(segment)) - np.repeat(np.cumsum(last - first) - last, last - first)
@@ -170,7 +175,7 @@ def _outermost(section: np.ndarray, levels: np.ndarray) -> np.ndarray:
 
 
 def _outline(radii: np.ndarray) -> np.ndarray:
-    """Radii by direction of sections of the body, as shares of the median one."""
+    """Radii of the body by direction, relative to the median radius."""
     body = radii[LEVELS // 8 : LEVELS // 2]
     return np.median(body / np.nanmedian(body, axis=1, keepdims=True), axis=0)
 
@@ -180,16 +185,17 @@ def _check_symmetry(around: np.ndarray, bounds: np.ndarray, fold: int, name: str
         front, side = bounds[1, 0], max(-bounds[0, 0], bounds[1, 1], -bounds[0, 1])
         if front < LEAST_FRONT * side:
             raise InputError(
-                f"profile(): {name} reaches {100 * front:.1f} cm from its axis to its front and {100 * side:.1f} cm to another side; expected its handle "
-                "or longer side at the front; correct 'front' and 'up'"
+                f"profile(): {name} reaches {100 * front:.1f} cm from its axis to its front and {100 * side:.1f} cm to "
+                "another side; expected its handle or longer side at the front; correct 'front' and 'up'"
             )
         return
-    # lugs aside
+    # The quantile leaves out lugs.
     changes = [np.nanquantile(np.abs(around - np.roll(around, round(turn * DIRECTIONS))), 0.9) for turn in TURNS[fold]]
     if max(changes) > CHANGE:
         raise InputError(
-            f"profile(): {name} is not {FOLDS[fold]}: a turn of {360 * TURNS[fold][np.argmax(changes)]:g} degrees about 'up' changes its outline by "
-            f"{100 * max(changes):.0f} % of its radius; expected {100 * CHANGE:.0f} % at most; correct 'symmetry' or 'up'"
+            f"profile(): {name} is not {FOLDS[fold]}: a turn of {360 * TURNS[fold][np.argmax(changes)]:g} degrees about "
+            f"'up' changes its outline by {100 * max(changes):.0f} % of its radius; expected {100 * CHANGE:.0f} % at "
+            "most; correct 'symmetry' or 'up'"
         )
 
 
@@ -198,19 +204,22 @@ def _turned(around: np.ndarray, fold: int) -> float:
         return 0.0
     angles = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
     harmonic = np.nansum(around**2 * np.exp(1j * fold * angles)) / np.nansum(around**2)
-    # The second harmonic is largest along the longer side; the fourth along a square's corners, which lie beside its
-    # sides.
+    # The second harmonic is largest along the longer side. The fourth is largest along the corners of a square, which
+    # lie between its sides.
     return float(np.angle(harmonic if fold == 2 else -harmonic)) / fold if abs(harmonic) > SHAPELESS else 0.0
 
 
 def _rim(found: Profile, fold: int, name: str) -> float:
-    """How far from the axis the middle of the wall is at the rim, on the +x side and those that the symmetry makes equal: the median."""
+    """Distance of the middle of the wall at the rim from the axis.
+
+    It is the median over the front and the sides that the symmetry makes equal.
+    """
     if crossings(found.sections[0][..., ::-1], 0.0).max(initial=-np.inf) > found.height / 4:
         raise _unmeasured(name, "it is closed above; is 'up' right?", "a bowl, open above")
     middles = []
     for section in found.sections[:: 1 if fold == ROUND else DIRECTIONS // fold]:
         side = section[(section[..., 0] > 0).all(axis=1)]
-        # below the top on this side: a rim may lean
+        # The level is relative to the top on this side, because a rim may lean.
         wall = crossings(side, side[..., 1].max(initial=-np.inf) - BELOW_RIM * found.height)
         if len(wall) > 1:
             middles.append(wall[-2:].mean())
@@ -220,17 +229,18 @@ def _rim(found: Profile, fold: int, name: str) -> float:
 
 
 def _bottle_levels(found: Profile, fold: int, name: str) -> tuple[float, float]:
-    """Heights of the neck's and the body's places."""
+    """Heights of the places of the neck and of the body."""
     radius, height, wanted = _mean_radius(found, fold), found.height, "a bottle with a neck above its body"
     width = float(np.nanmax(_widths(found)))
-    if width > height:  # of one that lies, a handle would be the neck
+    if width > height:  # a handle of a lying bottle would count as its neck
         raise _unmeasured(
             name, f"it is {100 * width:.1f} cm wide and {100 * height:.1f} cm high; is 'up' right?", wanted
         )
     levels = _levels(height) + height / 2
-    body = float(np.quantile(radius[: LEVELS // 2], 0.9))  # not the greatest: a seam; not the median: a waist
+    body = float(np.quantile(radius[: LEVELS // 2], 0.9))  # the largest may be a seam, and the median a waist
     neck = float(np.quantile(radius[LEVELS // 2 :], 0.2))
-    # the neck is what is above the shoulder's middle, which is half way between body and neck; settles after two
+    # The neck begins at the middle of the shoulder, where the radius is half way between those of body and neck. Two
+    # iterations usually suffice.
     for _ in range(4):
         below = (radius < (body + neck) / 2) & (np.arange(LEVELS) > np.argmax(radius[: LEVELS // 2]))
         if neck > NARROWER * body or not below.any():
@@ -238,46 +248,48 @@ def _bottle_levels(found: Profile, fold: int, name: str) -> tuple[float, float]:
         above = int(np.argmax(below))
         neck = float(np.quantile(radius[above:], 0.3))  # most caps are wider than their neck
     half_way = float(np.interp((body + neck) / 2, radius[[above, above - 1]], levels[[above, above - 1]]))
-    upright = slice(above // 4, above)  # without the rounding of the bottom edge
+    upright = slice(above // 4, above)  # leaves out the rounded bottom edge
     body_to = _shoulder_from(levels[upright], radius[upright], half_way, neck, height)
     return half_way / 2, (body_to - height) / 2
 
 
 def _widths(found: Profile) -> np.ndarray:
-    """By level and direction, both ways: what a leaning scan has more on one side it has less on the other."""
+    """Widths by level and direction; unlike radii, they do not depend on how a scan leans."""
     return found.radii[:, : DIRECTIONS // 2] + found.radii[:, DIRECTIONS // 2 :]
 
 
 def _mean_radius(found: Profile, fold: int) -> np.ndarray:
-    """Half the width by level, the median over directions, of an object with a handle over those beside it."""
+    """Half of the median width by level; directions towards a handle are left out."""
     beside = slice(DIRECTIONS // 16, 7 * DIRECTIONS // 16 + 1) if fold == 1 else slice(None)
     return np.nanmedian(_widths(found)[:, beside], axis=1) / 2
 
 
 def _shoulder_from(levels: np.ndarray, radius: np.ndarray, half_way: float, neck: float, height: float) -> float:
-    """Level above the base where the body ends.
+    """Level above the base where the body ends and the shoulder begins.
 
-    Of the shoulders of `BottleParameters` that are half as wide at `half_way`, on bodies with any bulge, the one that
-    fits best up to there. The highest level with 95 % of the body's radius was tried: it is in the middle of a dome, up
-    to 46 mm too high on a bottle of 0.27 m.
+    The shoulder is the best fit, up to its middle at `half_way`, of all shoulders of `BottleParameters` on bodies with
+    any bulge. The highest level with 95 % of the body's radius is no substitute, because it is in the middle of a dome
+    (docs/results/code_notes.md).
     """
     best, level = np.inf, half_way
     start = np.arange(LOWEST_SHOULDER * half_way, half_way, 0.0025 * height)[:, None]
     bulge = 4 * np.minimum(levels / start, 1) * (1 - np.minimum(levels / start, 1))
-    # None: a slope; with its share below half_way
+    # Shapes of shoulders, and their share below half_way; None is a straight slope.
     shoulders = [(curve, (1 - 0.5**curve) ** (1 / curve)) for curve in CURVES] + [(None, 0.5)]
     for curve, middle in shoulders:
         share = middle * np.maximum(levels - start, 0) / (half_way - start)
         wide = (1 + np.cos(np.pi * share)) / 2 if curve is None else np.maximum(1 - share**curve, 0) ** (1 / curve)
         rest = radius - neck * (1 - wide)
-        # Least squares for the body's radius, which `wide` scales, and its bulge.
+        # Least squares for the radius of the body, which multiplies `wide`, and for its bulge.
         ww, wb, bb, wr, br = (
             np.sum(one * other, axis=1, keepdims=True)
             for one, other in ((wide, wide), (wide, bulge), (bulge, bulge), (wide, rest), (bulge, rest))
         )
         body, out = np.array([bb * wr - wb * br, ww * br - wb * wr]) / (ww * bb - wb**2)
-        off = np.abs(rest - body * wide - out * bulge).sum(axis=1)  # not squared: seams and labels
-        off[(start + (half_way - start) / middle > height)[:, 0]] = np.inf  # its neck would begin above the top
+        off = np.abs(rest - body * wide - out * bulge).sum(
+            axis=1
+        )  # seams and labels are outliers, so it is not squared
+        off[(start + (half_way - start) / middle > height)[:, 0]] = np.inf  # the neck would begin above the top
         if off.min() < best:
             best, level = off.min(), start[off.argmin(), 0]
     return float(level)
@@ -285,5 +297,6 @@ def _shoulder_from(levels: np.ndarray, radius: np.ndarray, half_way: float, neck
 
 def _unmeasured(name: str, what: str, expected: str) -> InputError:
     return InputError(
-        f"profile_places(): {name} cannot be measured: {what} Expected {expected}: correct its 'up', or give 'places' for it"
+        f"profile_places(): {name} cannot be measured: {what} Expected {expected}: correct its 'up', or give 'places' "
+        "for it"
     )

@@ -28,7 +28,7 @@ SIGNS = np.array([(x, y, x * y) for x in (1, -1) for y in (1, -1)])  # of princi
 def principal_axes(
     points_a: Float[np.ndarray, "points 3"], points_b: Float[np.ndarray, "seen 3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Align centroids and principal axes; of the four choices of signs, take the one with the smallest chamfer distance.
+    """Align centroids and principal axes, with the signs that give the smallest chamfer distance.
 
     Args:
         points_a: cloud of object a, (points, 3), metres.
@@ -78,7 +78,9 @@ def every_registration(
     """The result of point-to-point ICP from every start.
 
     Args:
-        points_a, points_b, rotations: as for `iterative_closest_points`.
+        points_a: cloud of object a, (points, 3), metres.
+        points_b: cloud of object b, (seen, 3), metres.
+        rotations: initial rotations of cloud a about its centroid, (starts, 3, 3); the centroids coincide.
 
     Returns:
         Motions of cloud a onto cloud b, (starts, 4, 4), and their mean squared distances, (starts,), square metres.

@@ -87,7 +87,8 @@ def object_of(category: str, seed: int, index: int, size: float, fold: int | Non
 
     Args:
         category: family of the object.
-        seed, index: number of the object.
+        seed: seed of the objects.
+        index: number of the object.
         size: size, see `size_of`, metres.
         fold: symmetry of the object; any by default.
     """
@@ -129,7 +130,8 @@ def generated_case(
 
     Args:
         category: "mug", "bowl" or "bottle".
-        seed, index: number of the pair.
+        seed: seed of the pairs.
+        index: number of the pair.
         size: size of both objects before a condition of size, see `size_of`, metres; by default the common size of the
             category.
         points: number of points of each complete cloud, uniform by area.
@@ -161,10 +163,13 @@ def mesh_case(
     The generated object has the category, the size and the symmetry of the mesh.
 
     Args:
-        seed, pose: number of the pose. The pose and the generated object depend on the name of the mesh too, but not on
-            other meshes.
+        seed: seed of the poses and the generated objects. Both depend on the name of the mesh too, but not on other
+            meshes.
+        pose: number of the pose.
         target: the mesh.
-        points, place, clouds: see `generated_case`.
+        points: number of points of each complete cloud, uniform by area.
+        place: name of a frame of the category; by default the frame at which demonstrations pick.
+        clouds: condition of the mesh's cloud; poses and the generated object do not depend on it.
 
     Raises:
         InputError: there is no such condition or place.

@@ -83,7 +83,7 @@ def path_error(estimate: Trajectory, truth: Trajectory) -> float:
 
 
 def shape_error(estimate: Float[np.ndarray, "poses 3"], truth: Float[np.ndarray, "poses 3"]) -> float:
-    """Difference of the shapes of two paths: root mean square distance of waypoints after the best rigid motion, metres.
+    """Root mean square distance of the waypoints of two paths after the best rigid motion, metres.
 
     Args:
         estimate: translations of the estimated waypoints, (poses, 3), metres.

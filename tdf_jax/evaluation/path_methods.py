@@ -110,7 +110,7 @@ class Attempts:
         return _encoded(self.task, self.model)
 
     def of(self, method: str) -> Attempt | None:
-        """The attempt of one of `METHODS`; None if it cannot run, such as the oracle on a mesh without correspondences."""
+        """The attempt of one of `METHODS`; None if it cannot run, as the oracle without correspondences."""
         encoded = self._encoded if method in NETWORKS else None
         return METHODS[method](self.task, self.model, encoded, self.key, self.num_starts)
 

@@ -122,9 +122,10 @@ def _setup(scores, model, settings) -> str:
         f"query points; the variants of ICP and NDF with {MANY} starts take more time. A task is a trajectory of "
         f"{NUM_POSES} poses, demonstrated at the handle of one mug, to be imitated on another mug in a uniform random "
         "pose, with a goal. Tasks take six paths in turn, and each path takes four goals in turn: the last pose of the "
-        "demonstration, moved with the centroid; the same, moved by 10 or 30 cm in a random direction; or a pose as far "
-        "behind the demonstrated pick as that pose lies ahead of it. The ground truth picks the same place on the other "
-        "mug; from there to the goal, the demonstration is warped by an even interpolation of the motions of both ends. "
+        "demonstration, moved with the centroid; the same, moved by 10 or 30 cm in a random direction; or a pose as "
+        "far behind the demonstrated pick as that pose lies ahead of it. The ground truth picks the same place on the "
+        "other mug; from there to the goal, the demonstration is warped by an even interpolation of the motions of "
+        "both ends. "
         "The warp is a definition: methods that estimate one motion of the object (PCA, ICP, random weights, the "
         "oracle, *carried*, `tdf_jax`) use the same formula, so their path errors follow from their pick errors. "
         f"Variants run on every {EVERY}th task.\n\n"
@@ -260,8 +261,8 @@ def _reliability(reliability: Mapping[str, Any]) -> str:
     return (
         f"## Confidence\n\n`result.confidence` of the {reliability['picks']} picks of `{LIBRARY}`, all clouds, in bins. "
         f"The curve was fitted on picks of seed {FITTED_ON}. The mean difference of the confidence and the share of "
-        f"right picks is {reliability['calibration_error']:.3f}.{order}\n\n![Reliability]({PICTURES['reliability']})\n\n"
-        + markdown(heads, rows)
+        f"right picks is {reliability['calibration_error']:.3f}.{order}\n\n"
+        f"![Reliability]({PICTURES['reliability']})\n\n" + markdown(heads, rows)
     )
 
 

@@ -61,7 +61,7 @@ def run(
         attempts = Attempts(task, model, key, num_starts)
         for method in (method for method in methods if tried(method, task.index)):
 
-            def arrays(method=method):
+            def arrays(attempts=attempts, method=method):
                 attempt = attempts.of(method)
                 return {} if attempt is None else vars(attempt)
 

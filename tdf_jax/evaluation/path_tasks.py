@@ -60,7 +60,8 @@ def make_task(case: Case, seed: int, index: int) -> Task:
 
     Args:
         case: the objects.
-        seed, index: number of the task.
+        seed: seed of the tasks.
+        index: number of the task.
 
     Raises:
         InputError: the index is negative.

@@ -144,9 +144,9 @@ def _method(settings: Mapping[str, Any]) -> str:
     )
     return (
         "One pose at a place, demonstrated on a generated object of the same size and symmetry; the target is in a "
-        f"uniform random pose; best of {settings['num_starts']} starts by loss (`tdf evaluate {words}`). Errors are from "
-        "the nearest of the poses that the symmetry of the target makes equal. Success: position and rotation error are "
-        "both within the bounds; in brackets the 95 % bootstrap interval over objects."
+        f"uniform random pose; best of {settings['num_starts']} starts by loss (`tdf evaluate {words}`). Errors are "
+        "from the nearest of the poses that the symmetry of the target makes equal. Success: position and rotation "
+        "error are both within the bounds; in brackets the 95 % bootstrap interval over objects."
     )
 
 

@@ -1,8 +1,8 @@
 """Semantic places of a mug's mesh, measured on its section along the plane of symmetry.
 
-They are those of `tdf_jax.shapes.Mug`: the canonical frame's origin on the body's axis at mid height, z up, the handle
-along +x, and frames T_object_place of the handle, the rim and the base. Surfaces may be open: nothing is asked of the
-inside.
+Frames are as in `tdf_jax.shapes.Mug`: the origin of the canonical frame is on the body's axis at mid height, z points
+up and the handle along +x, and T_object_place are frames of the handle, the rim and the base. The mesh may be open,
+because no measurement needs its inside.
 """
 
 import dataclasses
@@ -18,20 +18,21 @@ if TYPE_CHECKING:
     import trimesh
 
 PLACES = ("handle", "rim", "base")
-LEVELS = 1000  # horizontal lines through the section: 0.1 mm apart on a common mug
-CLEAR = (0.02, 0.05)  # of the height, from the wall: where an arm of the handle is cut, past most fillets
-BELOW_RIM = 0.01  # of the height: where the wall's middle is taken, within the rounding of its edges
-OFF_AXIS = 0.15  # of the radius: how far from the axis the body may be widest across
+LEVELS = 1000  # horizontal lines through the section; they are 0.1 mm apart on a common mug
+# Shares of the height: distances from the wall at which an arm of the handle is cut, beyond most fillets.
+CLEAR = (0.02, 0.05)
+BELOW_RIM = 0.01  # share of the height: the middle of the wall is measured this far below the rounded rim
+OFF_AXIS = 0.15  # share of the radius: largest distance between the axis and the widest part of the body
 
 
 @dataclasses.dataclass(frozen=True)
 class Body:
-    """Where the body of a mug lies in the frame it was measured in.
+    """Measurements of the body of a mug, in the frame of its mesh.
 
     Attributes:
-        origin: on the axis at mid height, (3,), metres.
-        radius: half the extent across the plane of symmetry, metres.
-        height: metres.
+        origin: point on the axis at mid height, (3,), metres.
+        radius: half of the extent across the plane of symmetry, metres.
+        height: height, metres.
     """
 
     origin: Float[np.ndarray, "3"]
@@ -40,25 +41,26 @@ class Body:
 
 
 def body(mesh: "trimesh.Trimesh", name: str) -> Body:
-    """Find the body of a mug whose handle points along +x, z up; a handle that reaches over the rim does not count.
+    """Measure the body of a mug whose handle points along +x, z up; a handle above the rim does not change it.
 
     Args:
-        mesh: metres.
-        name: of the mesh, for messages.
+        mesh: the mesh, metres.
+        name: name of the mesh, for messages.
 
     Raises:
-        InputError: nothing reaches out along +x alone.
+        InputError: the mesh has no handle along +x alone.
     """
     x, y, z = np.asarray(mesh.vertices)[np.unique(mesh.faces)].T
     radius, middle = np.ptp(y) / 2, (y.min() + y.max()) / 2
     axis = x.min() + radius
-    widest = x[np.abs(y - middle) > 0.995 * radius]  # of a square mug, all along two sides
-    # A handle along -x shifts the axis by its reach, one along y widens the body: both put the widest part off the
-    # axis.
+    # A square mug is widest all along two sides.
+    widest = x[np.abs(y - middle) > 0.995 * radius]
+    # A handle along -x shifts the axis, and a handle along y widens the body. Both move the widest part off the axis.
     if x.max() < axis + 1.1 * radius or abs((widest.min() + widest.max()) / 2 - axis) > OFF_AXIS * radius:
         raise InputError(
-            f"body(): {name} has no handle along the axis given as 'handle': it is {100 * np.ptp(x):.1f} cm long that way and "
-            f"{100 * np.ptp(y):.1f} cm across; expected a body that is symmetric but for the handle; correct 'handle' and 'up'"
+            f"body(): {name} has no handle along the axis given as 'handle': it is {100 * np.ptp(x):.1f} cm long that "
+            f"way and {100 * np.ptp(y):.1f} cm across; expected a body that is symmetric but for the handle; correct "
+            "'handle' and 'up'"
         )
     opposite = z[x < axis]
     low, high = opposite.min(), opposite.max()
@@ -70,27 +72,26 @@ def measured_places(
 ) -> dict[str, Float[np.ndarray, "4 4"]]:
     """Frames of the handle, the rim and the base of a mug in its canonical frame.
 
-    The handle's origin is on its centre line, half way between its attachments, on the outermost branch; an attachment
-    is where the centre line of an arm, continued straight, meets the middle of the wall.
+    The origin of the handle is on its centre line, half way between its attachments, on the outermost branch. An
+    attachment is the point where the centre line of an arm, continued straight, meets the middle of the wall.
 
     Args:
-        mesh: canonical frame, metres.
-        height: of the body, metres.
-        name: of the mesh, for messages.
-        places: those to measure, of `PLACES`.
+        mesh: the mesh, metres, canonical frame.
+        height: height of the body, metres.
+        name: name of the mesh, for messages.
+        places: places to measure, of `PLACES`.
 
     Returns:
         T_object_place, 4x4, by the names of `tdf_jax.shapes.Mug.frames`.
 
     Raises:
-        InputError: the mesh is not an open cup, or has no handle with a finger hole, where one of these is to be
-            measured.
+        InputError: a place needs an open cup, or a handle with a finger hole, and the mesh has none.
     """
     found = {"base": frame(0.0, -height / 2)}
     if set(places) - set(found):
         section = _section(mesh)
         levels = (np.arange(LEVELS) + 0.5) / LEVELS * height - height / 2
-        # On the side without the handle, outer surface last.
+        # Walls on the side without the handle; the outer surface is last.
         walls = [np.sort(-row[row < 0]) for row in (crossings(section, level) for level in levels)]
         if any(len(row) < 2 for row in walls[3 * LEVELS // 4 : -LEVELS // 100]):
             raise _unmeasured(name, "its upper quarter is no open cup with a wall; is 'up' right?")
@@ -103,18 +104,18 @@ def measured_places(
 
 
 def frame(x: float, z: float, outward: float = 1.0) -> Float[np.ndarray, "4 4"]:
-    """T_object_frame at (x, 0, z), z up, its x axis along object x times `outward` (1 or -1)."""
+    """T_object_frame at (x, 0, z), 4x4, z up, with its x axis along the object's x axis times `outward` (1 or -1)."""
     T = np.diag([outward, outward, 1.0, 1.0])
     T[:3, 3] = x, 0.0, z
     return T
 
 
 def _grip(section, height: float, walls, name: str) -> tuple[float, float]:
-    """The handle's origin, (x, z)."""
+    """The origin of the handle, (x, z)."""
     step = height / LEVELS
     thickness = float(np.median([row[-1] - row[-2] for row in walls[LEVELS // 2 : -LEVELS // 50]]))
     outer = np.array([row[-1] for row in walls[LEVELS // 50 : -LEVELS // 50]])
-    outer = np.pad(outer, LEVELS // 50, mode="edge")  # without the roundings, and on beyond rim and base
+    outer = np.pad(outer, LEVELS // 50, mode="edge")  # leaves out the rounded edges, and continues beyond rim and base
     low, high = section[..., 1].min(), section[..., 1].max()
     levels = np.arange(low + step / 2, high, step)
     wall = np.interp(levels, (np.arange(LEVELS) + 0.5) * step - height / 2, outer)
@@ -122,7 +123,7 @@ def _grip(section, height: float, walls, name: str) -> tuple[float, float]:
     middles = []
     for clear in (share * height for share in CLEAR):
         beyond = np.array([np.sum(row > edge + clear) for row, edge in zip(rows, wall)])
-        # Going outward from here, an odd number of surfaces is crossed from within clay, an even one from within air.
+        # A ray from here to the outside crosses an odd number of surfaces if it starts inside the solid.
         arm = np.flatnonzero(beyond % 2)
         gaps = np.diff(arm)
         if len(arm) < 2 or gaps.max() * step < 0.1 * height:
@@ -139,16 +140,21 @@ def _grip(section, height: float, walls, name: str) -> tuple[float, float]:
 
 
 def _section(mesh) -> np.ndarray:
-    """Line segments (segments, 2, 2) of the surface in the x-z plane."""
+    """Line segments of the surface in the x-z plane, (segments, 2, 2)."""
     from trimesh.intersections import mesh_plane
 
-    # Beside the plane of symmetry by less than any mesh is accurate: vertices lie in the plane itself, often whole
-    # edges.
+    # The plane is moved by less than the accuracy of any mesh, because vertices, and often whole edges, lie in the
+    # plane of symmetry itself.
     return mesh_plane(mesh, plane_normal=[0, 1, 0], plane_origin=[0, 1e-6, 0])[..., [0, 2]]
 
 
 def crossings(section, level: float) -> np.ndarray:
-    """Where segments cross the line at a second coordinate, sorted."""
+    """First coordinates at which segments cross a line of constant second coordinate, in rising order.
+
+    Args:
+        section: line segments, (segments, 2, 2), metres.
+        level: second coordinate of the line, metres.
+    """
     a, b = section[:, 0], section[:, 1]
     crossing = (a[:, 1] > level) != (b[:, 1] > level)
     a, b = a[crossing], b[crossing]

@@ -38,7 +38,8 @@ def evidence(model: Model, category: str, seed: int, index: int, right: bool) ->
     Args:
         model: the network.
         category: category of the demonstration.
-        seed, index: number of the case.
+        seed: seed of the cases.
+        index: number of the case.
         right: whether the target is of that category.
     """
     clouds, others = CLOUDS[index % len(CLOUDS)], [name for name in FAMILIES if name != category]
