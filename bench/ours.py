@@ -62,7 +62,7 @@ def descent(model, settings, arrays):
     per_step = settings["per"] == "step"
     names = ("rotation_rate", "translation_rate", "final_rate")
     config = functools.partial(
-        tdf.OptimizeConfig, inits=len(arrays["starts"]), **{name: settings[name] for name in names}
+        tdf.OptimizeConfig, num_starts=len(arrays["starts"]), **{name: settings[name] for name in names}
     )
 
     def timed(iterations):
@@ -85,9 +85,9 @@ def descent(model, settings, arrays):
             (first, _), (seconds, result) = timed(1), timed(1 + settings["steps"])
             # steps of a millisecond drown in noise: then all of the call counts
             more = seconds - first if seconds > first else seconds
-            return {"losses": result.losses[:, : settings["steps"]], "seconds": more / settings["steps"]}
+            return {"losses": result.candidate_history[:, : settings["steps"]], "seconds": more / settings["steps"]}
         seconds, result = timed(settings["iterations"])
-        return {"losses": result.losses, "energies": result.energies, "seconds": seconds}
+        return {"losses": result.candidate_history, "energies": result.energies, "seconds": seconds}
 
     return call
 
@@ -176,5 +176,5 @@ def _problem(model, arrays):
     demonstration = tdf.Demonstration(
         jnp.asarray(arrays["shown"]), tdf.Trajectory(jnp.asarray(arrays["path"])), jnp.asarray(arrays["query"])
     )
-    energy = tdf.EnergyWeights(correlation=float(arrays["correlation"]), lever=float(arrays["lever"]))
+    energy = tdf.EnergyWeights(correlation=float(arrays["correlation"]), rotation_scale=float(arrays["lever"]))
     return tdf.encode(model, jnp.asarray(arrays["new"])), tdf.describe(model, demonstration), energy

@@ -1,4 +1,4 @@
-"""Imitation, the whole way in one call: demonstration + new object's cloud -> trajectory."""
+"""Imitation in one call: a demonstration and a new object's point cloud give a trajectory."""
 
 import dataclasses
 import warnings
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.deprecation import renamed_keywords
 from tdf_jax._internal.errors import CategoryWarning, InputError
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference, describe
@@ -25,6 +26,7 @@ from tdf_jax.uncertainty.calibration import CALIBRATED, CURVES, confidence, reco
 DOUBT = 0.5  # probability of the demonstration's category below which a warning is issued
 
 
+@renamed_keywords(mesh="device_mesh")
 def imitate(
     model: Model,
     demonstration: Demonstration | Sequence[Demonstration] | Reference,
@@ -37,36 +39,36 @@ def imitate(
     energy: EnergyWeights | None = None,
     config: CarryConfig | SolveConfig | OptimizeConfig = CarryConfig(),
     progress: Callable | None = None,
-    mesh: jax.sharding.Mesh | None = None,
+    device_mesh: jax.sharding.Mesh | None = None,
 ) -> Result:
     """Imitate a demonstrated trajectory on a new object of the same category.
 
-    By default the pick is found by descriptors, and the demonstration is carried from there to the goal. With
+    By default the pick is found by descriptors, and the demonstrated path is warped from there to end at the goal. With
     `config=SolveConfig()` or `OptimizeConfig()` the paper's energy, eq. 3, is minimised over all waypoints, by
     Gauss-Newton steps or by Adam (docs/results/benchmark.md compares them).
 
-    Clouds denser than the network's training clouds are thinned, see `encode`.
+    A cloud denser than the network's training clouds is reduced by farthest-point sampling, see `encode`.
 
     Args:
         model: the network.
         demonstration: one, several with the same query points, or a `Reference` from `describe` to share between calls.
-        points: the new object's cloud, (points, 3), metres, world frame.
+        points: point cloud of the new object, (points, 3), metres, world frame.
         key: random key, such as `jax.random.key(0)`; the result is a function of it.
-        goal: last pose, T_world_query as `wxyz_xyz`; by default, if it is kept, the demonstration's last pose, carried
-            by the centroids.
-        goal_offset: world vector added to the goal's translation, metres.
-        fix_last: keep the last pose at the goal. Without, such as for the one pose of a grasp, the demonstration is
-            carried rigidly with the pick; or, with other configs, all poses are found alike, and a goal is where the
-            last one starts.
-        energy: weights of eq. 3's terms, by default the paper's; only with a `config` that minimises it.
-        config: settings of `carry`; or of `solve`; or, for Adam as in the paper and for energies with eq. 6, of
+        goal: last pose, (7,), T_world_query as `wxyz_xyz`; by default, with `fix_last`, the demonstration's last pose,
+            moved by the centroids.
+        goal_offset: vector that is added to the goal's translation, (3,), metres, world frame.
+        fix_last: keep the last pose at the goal. Otherwise, such as for the one pose of a grasp, the demonstration is
+            carried rigidly with the pick; with the other configs all poses are free, and a goal is where the last one
+            starts.
+        energy: weights of the terms of eq. 3, by default the paper's; only with a `config` that minimises it.
+        config: settings of `carry`, of `solve`, or, for Adam as in the paper and for energies with eq. 6, of
             `optimize`.
-        progress, mesh: see `solve` and `optimize`.
+        progress: see `solve` and `optimize`.
+        device_mesh: see `solve` and `optimize`.
 
     Returns:
-        The result; `.trajectory` is the best one, T_world_query. A `CategoryWarning` is issued if the object is more
-        likely of another category than the demonstration's, where that is known: for shipped weights, and the default
-        config.
+        The result; `.trajectory` is the best trajectory, T_world_query. A `CategoryWarning` is issued if the object is
+        probably of another category than the demonstration's. This is known for shipped weights and the default config.
 
     Raises:
         InputError: bad points, goal, offset or settings, or an energy that `carry` would not use.
@@ -76,15 +78,16 @@ def imitate(
         raise InputError(f"imitate(): config is {config!r}; expected a CarryConfig, SolveConfig or OptimizeConfig")
     if isinstance(config, CarryConfig) and energy is not None:
         raise InputError(
-            "imitate(): energy is given, but carrying minimises no eq. 3; expected config=SolveConfig() or OptimizeConfig() with it, or no energy"
+            "imitate(): energy is given, but `carry` does not minimise eq. 3; expected no energy, or config=SolveConfig() "
+            "or OptimizeConfig() with it"
         )
     reference = demonstration if isinstance(demonstration, Reference) else describe(model, demonstration)
     field = encode(model, points)
-    goal = None if goal is None else _finite("goal", goal, (7,))
+    goal = None if goal is None else jnp.asarray(checks.pose("imitate()", "goal", goal), float)
     if goal_offset is not None:
         goal = default_goal(field, reference) if goal is None else goal
-        goal = goal + jnp.pad(_finite("goal_offset", goal_offset, (3,)), (4, 0))
-    settings = {"goal": goal, "fix_last": fix_last, "progress": progress, "mesh": mesh}
+        goal = goal + jnp.pad(jnp.asarray(checks.vector("imitate()", "goal_offset", goal_offset)), (4, 0))
+    settings = {"goal": goal, "fix_last": fix_last, "progress": progress, "device_mesh": device_mesh}
     if isinstance(config, CarryConfig):
         result = carry(field, reference, key, config=config, **settings)
         return _judged(result, model.info.name, field, points)
@@ -95,19 +98,22 @@ def imitate(
 
 
 def _judged(result: Result, weights: str, field, points) -> Result:
-    """The result with what shipped weights are calibrated for: how likely the pick is right, and the object one of their category."""
-    recognised = (
-        recognition(result.residual, surface_logit(field, points), CURVES[weights]) if weights in CURVES else None
-    )
+    """The result with the probabilities that shipped weights are calibrated for; NaN where they are not."""
+    recognised = confident = None
+    if weights in CURVES:
+        recognised = recognition(float(result.residual), surface_logit(field, points), CURVES[weights])
+    if weights in CALIBRATED:
+        confident = confidence(float(result.residual))
     if recognised is not None and recognised < DOUBT:
         warnings.warn(
-            f"imitate(): the object does not look like one of the demonstration's category to the weights {weights!r} (probability {recognised:.2g}); check the target, its unit and "
-            "the weights",
+            "imitate(): the object does not look like one of the demonstration's category to the weights "
+            f"{weights!r} (probability {recognised:.2g}); check the target, its unit and the weights",
             CategoryWarning,
-            stacklevel=3,
+            stacklevel=4,  # the caller of `imitate`, whose decorator is one frame
         )
+    known = {"recognised": recognised, "confidence": confident}
     return dataclasses.replace(
-        result, recognised=recognised, confidence=confidence(result.residual) if weights in CALIBRATED else None
+        result, **{name: jnp.asarray(jnp.nan if value is None else value) for name, value in known.items()}
     )
 
 
@@ -125,13 +131,14 @@ def imitate_batch(
     and memory does not grow with the number of targets.
 
     Args:
-        model, demonstration: as for `imitate`.
-        clouds: one cloud a target, (points, 3), metres, world frame; sizes may differ.
+        model: as for `imitate`.
+        demonstration: as for `imitate`.
+        clouds: one point cloud for each target, (points, 3), metres, world frame; sizes may differ.
         key: random key; target i uses `jax.random.fold_in(key, i)`.
-        settings: as for `imitate`, shared by all targets.
+        **settings: as for `imitate`, shared by all targets.
 
     Returns:
-        One result a target, in order.
+        One result for each target, in order.
 
     Raises:
         InputError: no clouds, or as for `imitate`.
@@ -145,12 +152,3 @@ def imitate_batch(
         imitate(model, reference, points, key=jax.random.fold_in(key, index), **settings)
         for index, points in enumerate(clouds)
     ]
-
-
-def _finite(name, value, shape):
-    value = jnp.asarray(value, dtype=float)
-    if value.shape != shape:
-        raise InputError(f"imitate(): {name} has shape {value.shape}; expected {shape}")
-    if not jnp.isfinite(value).all():
-        raise InputError(f"imitate(): {name} is {value}; expected finite numbers")
-    return value

@@ -11,7 +11,7 @@ import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.sampling import thin
 
-CONFIG = tdf.OptimizeConfig(inits=3, iterations=5)
+CONFIG = tdf.OptimizeConfig(num_starts=3, iterations=5)
 KEY = jax.random.key(0)
 TARGET = random_cloud(3).astype(np.float32)
 
@@ -37,7 +37,7 @@ def result(imitate, demonstration):
 def test_it_is_describe_encode_optimize(result, field, reference):
     assert_equal(result, tdf.optimize(field, reference, KEY, config=CONFIG))
     assert isinstance(result.trajectory, tdf.Trajectory) and result.trajectory.num_poses == 4
-    assert result.losses.shape == (3, 5)
+    assert result.candidate_history.shape == (3, 5)
 
 
 def test_a_reference_can_be_shared_between_calls(imitate, demonstration, result, reference):
@@ -49,8 +49,8 @@ def test_several_demonstrations(imitate, small_model, demonstration, result):
     other = dataclasses.replace(demonstration, points=random_cloud(7).astype(np.float32))
     both = imitate([demonstration, other])
     assert_equal(both, imitate(tdf.describe(small_model, [demonstration, other])))
-    assert_equal(both.starts, result.starts)  # the first one's trajectory
-    assert np.abs(both.losses - result.losses).min() > 1e-6
+    assert_equal(both.initial_trajectories, result.initial_trajectories)  # the first one's trajectory
+    assert np.abs(both.candidate_history - result.candidate_history).min() > 1e-6
 
 
 def test_the_goal_is_the_demonstrations_carried_by_the_centroids(result, demonstration):
@@ -92,7 +92,7 @@ def test_a_batch_is_every_target_with_a_key_of_its_own(small_model, imitate, dem
 def test_a_batch_shares_its_settings(small_model, reference):
     results = tdf.imitate_batch(small_model, reference, [TARGET] * 2, key=KEY, config=CONFIG, goal_offset=(0, 0, 1))
     np.testing.assert_allclose(results[0].trajectory.wxyz_xyz[-1], results[1].trajectory.wxyz_xyz[-1])
-    assert np.abs(results[0].starts - results[1].starts).max() > 0.01
+    assert np.abs(results[0].initial_trajectories - results[1].initial_trajectories).max() > 0.01
 
 
 def test_progress_is_passed_on(imitate, reference):
@@ -124,11 +124,27 @@ def test_bad_input_is_refused(imitate, reference, settings, message):
         imitate(reference, **settings)
 
 
-@pytest.mark.parametrize("config", [CONFIG, tdf.SolveConfig(inits=3, scouts=3, points=8, steps=(2, 2, 2, 2, 2, 2))])
+@pytest.mark.parametrize(
+    "config",
+    [
+        CONFIG,
+        tdf.SolveConfig(
+            num_trajectory_starts=3,
+            num_starts=3,
+            num_coarse_queries=8,
+            coarse_steps=2,
+            prune_steps=2,
+            search_steps=2,
+            propagate_steps=2,
+            refine_steps=2,
+            polish_steps=2,
+        ),
+    ],
+)
 def test_a_demonstration_of_one_pose_is_found_where_it_is_free(imitate, demonstration, config):
     one = dataclasses.replace(demonstration, trajectory=tdf.Trajectory(demonstration.trajectory.wxyz_xyz[:1]))
     for inits in (3, 1):
-        result = imitate(one, fix_last=False, config=dataclasses.replace(config, inits=inits))
+        result = imitate(one, fix_last=False, config=dataclasses.replace(config, num_starts=inits))
         assert result.trajectory.num_poses == 1 and np.isfinite(result.energies).all()
     with pytest.raises(InputError, match="one pose and fix_last keeps it; expected fix_last=False"):
         imitate(one, config=config)

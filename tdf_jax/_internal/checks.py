@@ -1,8 +1,8 @@
 """Validators of arguments, each with the one message that its kind of mistake gets.
 
-`function` begins the message: "solve()" in the library, "tdf imitate" on the command line. A validator returns the value, in
-the type that the caller wants. Shapes are checked of traced values too; what depends on numbers lets traced ones through,
-because they are not known yet.
+`function` begins the message: "solve()" in the library, "tdf imitate" on the command line. A validator returns the
+value, in the type that the caller wants. Shapes are checked of traced values too; what depends on numbers lets traced
+ones through, because they are not known yet.
 """
 
 from collections.abc import Collection

@@ -31,8 +31,12 @@ def renamed_keywords(**new_names: str):
     return decorate
 
 
-def renamed_fields(**new_names: str):
-    """Decorator of a dataclass whose fields were renamed: old keywords and attributes still work."""
+def renamed_fields(**new_names: str | tuple[str, ...]):
+    """Decorator of a dataclass whose fields were renamed: old keywords and attributes still work.
+
+    A field that was a tuple by position may have become several fields: `renamed_fields(steps=("first_steps",
+    "last_steps"))`.
+    """
 
     def decorate(cls):
         original = cls.__init__
@@ -40,11 +44,18 @@ def renamed_fields(**new_names: str):
         @functools.wraps(original)
         def accepting(self, *arguments, **keywords):
             for old, new in new_names.items():
-                if old in keywords:
-                    if new in keywords:
-                        raise InputError(f"{cls.__name__}(): got {new} and {old}, its former name; expected {new}")
-                    warn(f"{cls.__name__}({old}=...)", f"{new}=")
-                    keywords[new] = keywords.pop(old)
+                if old not in keywords:
+                    continue
+                value, several = keywords.pop(old), isinstance(new, tuple)
+                names = new if several else (new,)
+                values = tuple(value) if several and isinstance(value, tuple | list) else (value,)
+                if len(values) != len(names):
+                    raise InputError(f"{cls.__name__}(): {old} is {value!r}; expected {', '.join(names)}")
+                for name in names:
+                    if name in keywords:
+                        raise InputError(f"{cls.__name__}(): got {name} and {old}, its former name; expected {name}")
+                warn(f"{cls.__name__}({old}=...)", ", ".join(f"{name}=" for name in names))
+                keywords.update(zip(names, values))
             original(self, *arguments, **keywords)
 
         cls.__init__ = accepting
@@ -57,9 +68,9 @@ def renamed_fields(**new_names: str):
     return decorate
 
 
-def _renamed_attribute(name: str, old: str, new: str) -> property:
+def _renamed_attribute(name: str, old: str, new: str | tuple[str, ...]) -> property:
     def get(self):
-        warn(f"{name}.{old}", f"{name}.{new}")
-        return getattr(self, new)
+        warn(f"{name}.{old}", f"{name}.{new}" if isinstance(new, str) else ", ".join(new))
+        return getattr(self, new) if isinstance(new, str) else tuple(getattr(self, one) for one in new)
 
     return property(get, doc=f"Former name of `{new}`.")

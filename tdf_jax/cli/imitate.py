@@ -37,7 +37,7 @@ from tdf_jax.uncertainty.modes import cluster_poses
 # Folded into the seed's key: `random_pose` draws a generated mug's rotation from the key of the same seed, and a start
 # drawn from that one would be the answer.
 STREAM = 0x1D317A7E
-SCHEMA = 2  # raised when a field of result.json changes its meaning or goes
+SCHEMA = 3  # raised when a field of result.json changes its meaning or goes
 RESULT = "result.json"
 NAMES = (RESULT, "trajectory.npz", "trajectory.tum", "imitation.png", "loss.png")
 
@@ -67,7 +67,7 @@ def _run(settings: Settings, folder: Path) -> dict:
         scene = make_scene(settings, query_key)
     with _timed(seconds, "encode"):
         reference = jax.block_until_ready(describe(model, scene.demonstration))
-    with _timed(seconds, "optimise"), _progress(_steps(config)) as progress:
+    with _timed(seconds, "optimise"), _progress(config.num_steps) as progress:
         with warnings.catch_warnings(record=True) as doubts:
             warnings.simplefilter("always", CategoryWarning)
             result = imitate_scene(
@@ -95,20 +95,14 @@ def _run(settings: Settings, folder: Path) -> dict:
 
 
 def _config(settings: Settings) -> CarryConfig | SolveConfig | OptimizeConfig:
-    starts = {} if settings.inits is None else {"inits": settings.inits}
+    starts = {} if settings.num_starts is None else {"num_starts": settings.num_starts}
     if settings.method == "adam":
         return OptimizeConfig(**starts, **({} if settings.iterations is None else {"iterations": settings.iterations}))
     if settings.iterations is not None:
         raise InputError("tdf imitate: --iterations is for --method adam; drop one or add the other")
     if settings.method == "gauss-newton":
-        return SolveConfig(**starts)
-    return CarryConfig() if settings.inits is None else CarryConfig(scouts=settings.inits)
-
-
-def _steps(config: CarryConfig | SolveConfig | OptimizeConfig) -> int:
-    if isinstance(config, OptimizeConfig):
-        return config.iterations
-    return sum((config.solver if isinstance(config, CarryConfig) else config).steps)
+        return SolveConfig() if settings.num_starts is None else SolveConfig(num_trajectory_starts=settings.num_starts)
+    return CarryConfig(**starts)
 
 
 def _draw(folder: Path, scene: Scene, result: Result, rows: str) -> None:
@@ -120,7 +114,7 @@ def _draw(folder: Path, scene: Scene, result: Result, rows: str) -> None:
     title = _title(result.loss, _errors(trajectory, expected))
     figure = imitation_figure(scene.demonstration, scene.points, trajectory, expected, scene.meshes, title)
     save_figure(folder / "imitation.png", figure)
-    history = np.column_stack([result.losses, result.energies])
+    history = np.column_stack([result.candidate_history, result.energies])
     save_figure(folder / "loss.png", loss_figure(history, result.best, rows=rows))
 
 
@@ -194,15 +188,15 @@ def _record(
         "target": {"points": len(scene.points), "T_world_target": scene.T_world_target.tolist()},
         "status": result.status,
         "best": result.best,
-        "loss": {"start": float(result.losses[result.best, 0]), "end": result.loss},
-        "confidence": result.confidence,
-        "recognised": result.recognised,
+        "loss": {"start": float(result.candidate_history[result.best, 0]), "end": result.loss},
+        "confidence": _plain(float(result.confidence)),
+        "recognised": _plain(float(result.recognised)),
         "modes": _modes(config, result),
         "errors": _errors(trajectory, expected),
         "goal": _plain(trajectory.wxyz_xyz[-1]),
         "expected": None if expected is None else _plain(expected.wxyz_xyz),
         "energies": _plain(result.energies),
-        "losses": _plain(result.losses),
+        "losses": _plain(result.candidate_history),
         "seconds": {name: round(value, 3) for name, value in timings.items()},
     }
 
@@ -213,13 +207,16 @@ def _table(record: dict, out: Path) -> str:
     optimiser = record["optimiser"]
     sizes = record["demonstration"] | optimiser
     if record["modes"] is not None:
-        starts, best = "{scouts} starts of the pick", "of the best pick"
-    elif "scouts" in sizes:
-        starts, best = "{inits} starts, {scouts} of the keyframe", "the best candidate of every waypoint"
+        starts, best = "{num_starts} starts of the pick", "of the best pick"
+    elif "num_trajectory_starts" in sizes:
+        starts, best = (
+            "{num_trajectory_starts} starts, {num_starts} of the keyframe",
+            "the best candidate of every waypoint",
+        )
     else:
         starts, best = (
-            "{inits} starts, {iterations} iterations",
-            f"start {record['best'] + 1} of {sizes['inits']}; {record['status']}",
+            "{num_starts} starts, {iterations} iterations",
+            f"start {record['best'] + 1} of {sizes['num_starts']}; {record['status']}",
         )
     parts = ", ".join(f"{name} {value:.1f}" for name, value in seconds.items() if name != "total")
     pick = path = "n/a (the truth is not known)"

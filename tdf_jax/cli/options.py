@@ -9,9 +9,8 @@ import tyro
 from jaxtyping import PRNGKeyArray
 
 from tdf_jax._internal.errors import InputError
-from tdf_jax.evaluation.cases import Case, generated_case, random_pose
-from tdf_jax.evaluation.pick_transfer import QUERY_SIZE
-from tdf_jax.evaluation.scene import Scene, place_demonstration
+from tdf_jax.evaluation.cases import QUERY_SIZE, Case, generated_case, place_demonstration, random_pose
+from tdf_jax.evaluation.scene import Scene
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.query import box_query
 from tdf_jax.geometry.trajectory import resample
@@ -41,7 +40,7 @@ class SceneSettings:
         category: of generated objects.
         trajectory: shape of a generated demonstration, from a mug's handle, a bowl's rim or a bottle's neck to a place
             0.30 m away; lift_over sets it down on a shelf there.
-        poses: of the trajectory; a demonstration file is resampled to another number.
+        num_poses: of the trajectory; a demonstration file is resampled to another number.
         queries: query points of a generated demonstration.
         points: drawn from a mesh, or from a larger cloud.
         seed: of every draw.
@@ -59,7 +58,7 @@ class SceneSettings:
         Literal["line", "semicircle", "wave", "lift_over", "tilt_and_pour", "hang_on_rack"] | None,
         _option(default="wave of a mug, lift_over of others"),
     ] = None
-    poses: Annotated[int | None, _option("INT", "7, or those of the demonstration file")] = None
+    num_poses: Annotated[int | None, _option("INT", "7, or those of the demonstration file")] = None
     queries: Annotated[int | None, _option("INT", "128")] = None
     points: int = 1500
     seed: int = 0
@@ -77,7 +76,7 @@ class Settings(SceneSettings):
         k: weight of the correlation term of eq. 3, for the methods that minimise it; the paper's best is 0.02.
         method: carry the demonstration from the pick to the goal; or minimise the paper's energy, eq. 3, by damped
             Gauss-Newton steps, or by Adam's as the paper does.
-        inits: random starts.
+        num_starts: number of random starts.
         iterations: Adam's steps.
         out: folder to write; an earlier result there is replaced.
         no_plots: leave out imitation.png and loss.png.
@@ -87,7 +86,7 @@ class Settings(SceneSettings):
     goal_offset: Annotated[tuple[float, float, float], _option("X Y Z")] = (0.0, 0.0, 0.0)
     k: Annotated[float | None, _option("FLOAT", "0.02")] = None
     method: Literal["carry", "gauss-newton", "adam"] = "carry"
-    inits: Annotated[int | None, _option("INT", "64 of the pick; 10 of other methods")] = None
+    num_starts: Annotated[int | None, _option("INT", "64 of the pick; 10 of other methods")] = None
     iterations: Annotated[int | None, _option("INT", "100")] = None
     out: Annotated[Path, _option("DIR")] = Path("imitation")
     no_plots: bool = False
@@ -170,7 +169,7 @@ def resolved(settings: SceneSettings) -> SceneSettings:
             settings,
             target_pose=pose,
             trajectory=settings.trajectory or ("wave" if category == "mug" else "lift_over"),
-            poses=7 if settings.poses is None else settings.poses,
+            num_poses=7 if settings.num_poses is None else settings.num_poses,
             queries=128 if settings.queries is None else settings.queries,
         )
     for name in ("trajectory", "queries"):
@@ -191,8 +190,8 @@ def _check_numbers(settings: SceneSettings) -> None:
             raise InputError(
                 "tdf imitate: --k is a weight of eq. 3, which --method carry does not minimise; drop it, or add --method gauss-newton or adam"
             )
-        if settings.inits is not None and settings.inits < 1:
-            raise InputError(f"tdf imitate: --inits is {settings.inits}; expected at least 1")
+        if settings.num_starts is not None and settings.num_starts < 1:
+            raise InputError(f"tdf imitate: --num-starts is {settings.num_starts}; expected at least 1")
         if settings.k is not None and not 0 <= settings.k < np.inf:
             raise InputError(f"tdf imitate: --k is {settings.k}; expected a weight of 0 or more")
         if not np.isfinite(settings.goal_offset).all():
@@ -256,9 +255,9 @@ def _read_demonstration(settings: SceneSettings) -> Demonstration | None:
     if settings.demonstration is None:
         return None
     shown = load_demonstration(settings.demonstration)
-    if settings.poses in (None, shown.trajectory.num_poses):
+    if settings.num_poses in (None, shown.trajectory.num_poses):
         return shown
-    return dataclasses.replace(shown, trajectory=resample(shown.trajectory, settings.poses))
+    return dataclasses.replace(shown, trajectory=resample(shown.trajectory, settings.num_poses))
 
 
 def _read_target(settings: SceneSettings):
@@ -273,7 +272,7 @@ def _read_target(settings: SceneSettings):
 
 
 def _generated(settings: SceneSettings, pair: Case, key: PRNGKeyArray) -> Demonstration:
-    return place_demonstration(pair, settings.trajectory, settings.poses, box_query(key, settings.queries, QUERY_SIZE))
+    return place_demonstration(pair, settings.trajectory, settings.num_poses, box_query(key, settings.queries, QUERY_SIZE))
 
 
 def _moved(points, T):

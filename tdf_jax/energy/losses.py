@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tdf_jax._internal.errors import InputError
+from tdf_jax._internal import checks
+from tdf_jax._internal.deprecation import renamed_fields, renamed_keywords
 from tdf_jax.energy.reference import Reference
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.trajectory import Trajectory
@@ -22,9 +23,10 @@ POSE_NORMS = ("frobenius", "metres_radians", "mean_absolute")
 COMPENSATOR_ORDERS = ("frobenius", "infinity")
 
 
+@renamed_fields(lever="rotation_scale")
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=["correlation", "compensator", "lever"],
+    data_fields=["correlation", "compensator", "rotation_scale"],
     meta_fields=["pose_norm", "compensator_order"],
 )
 @dataclasses.dataclass(frozen=True)
@@ -34,9 +36,9 @@ class EnergyWeights:
     Attributes:
         correlation: k of eq. 3; the paper's best is 0.02.
         compensator: weight of eq. 6, which the paper tried and rejected.
-        lever: metres that a turn of one unit counts as in eq. 3, where the paper does not say. At 1 m, the plain norm,
-            a turn outweighs the descriptors of a real, 0.1 m mug by far, and a mug that lies in another orientation is
-            not followed (docs/results/energy.md).
+        rotation_scale: metres that a turn of one unit counts as in eq. 3, where the paper does not say. At 1 m, the
+            plain norm, a turn outweighs the descriptors of a real, 0.1 m mug by far, and a mug that lies in another
+            orientation is not followed (docs/results/energy.md).
         pose_norm: the norm of eq. 3, which the paper does not specify: "frobenius", of the difference of the 4x4
             matrices, "metres_radians", sqrt(distance^2 + angle^2), or "mean_absolute", over the twelve numbers of (R,
             t), as eq. 2 is over channels.
@@ -48,20 +50,17 @@ class EnergyWeights:
 
     correlation: Float[Array, ""] | float = 0.02
     compensator: Float[Array, ""] | float = 0.0
-    lever: Float[Array, ""] | float = 0.05
+    rotation_scale: Float[Array, ""] | float = 0.05
     pose_norm: str = "frobenius"
     compensator_order: str = "frobenius"
 
     def __post_init__(self):
         for name, known in (("pose_norm", POSE_NORMS), ("compensator_order", COMPENSATOR_ORDERS)):
-            if getattr(self, name) not in known:
-                raise InputError(
-                    f"EnergyWeights(): {name} is {getattr(self, name)!r}; expected one of {', '.join(known)}"
-                )
-        for name in ("correlation", "compensator", "lever"):
+            checks.choice("EnergyWeights()", name, getattr(self, name), known)
+        for name in ("correlation", "compensator", "rotation_scale"):
             value = getattr(self, name)
-            if isinstance(value, int | float | np.number) and not 0 <= value < np.inf:
-                raise InputError(f"EnergyWeights(): {name} is {value}; expected a finite number of 0 or more")
+            if isinstance(value, int | float | np.number):  # not arrays: a gradient is an EnergyWeights too
+                checks.number("EnergyWeights()", name, value, least=0)
 
 
 def trajectory_energy(
@@ -124,15 +123,16 @@ def pose_energy(
         reference: the demonstration's.
         weights: of the terms.
     """
-    correlation = _correlation(R, t, origin, reference, weights.lever, weights.pose_norm)
+    correlation = _correlation(R, t, origin, reference, weights.rotation_scale, weights.pose_norm)
     return weights.correlation * correlation + weights.compensator * _compensator(R, t, weights.compensator_order)
 
 
+@renamed_keywords(lever="rotation_scale")
 def correlation_loss(
     trajectory: Trajectory,
     origin: Float[Array, "3"],
     reference: Reference,
-    lever: Float[Array, ""] | float = 1.0,
+    rotation_scale: Float[Array, ""] | float = 1.0,
     pose_norm: str = "frobenius",
 ) -> Float[Array, ""]:
     """l_c of eq. 3: mean over waypoints of ||T_ref - T||, on poses relative to each cloud's centroid with world axes.
@@ -143,9 +143,9 @@ def correlation_loss(
         trajectory: poses of the query frame in the world.
         origin: centroid of the new object's cloud, metres, world frame.
         reference: the demonstration's.
-        lever, pose_norm: see `EnergyWeights`; by default the plain Frobenius norm of the 4x4 matrices.
+        rotation_scale, pose_norm: see `EnergyWeights`; by default the plain Frobenius norm of the 4x4 matrices.
     """
-    return _correlation(trajectory.rotations, trajectory.translations, origin, reference, lever, pose_norm)
+    return _correlation(trajectory.rotations, trajectory.translations, origin, reference, rotation_scale, pose_norm)
 
 
 def compensator_loss(trajectory: Trajectory, order: str = "frobenius") -> Float[Array, ""]:
@@ -158,8 +158,7 @@ def compensator_loss(trajectory: Trajectory, order: str = "frobenius") -> Float[
     Raises:
         InputError: an unknown order.
     """
-    if order not in COMPENSATOR_ORDERS:
-        raise InputError(f"compensator_loss(): order is {order!r}; expected 'frobenius' or 'infinity'")
+    checks.choice("compensator_loss()", "order", order, COMPENSATOR_ORDERS)
     return _compensator(trajectory.rotations, trajectory.translations, order)
 
 
@@ -168,7 +167,7 @@ def pose_difference(
     t: Float[Array, "*batch 3"],
     origin: Float[Array, "3"],
     target: Float[Array, "*batch 7"],
-    lever: Float[Array, ""] | float,
+    rotation_scale: Float[Array, ""] | float,
     pose_norm: str,
 ) -> Float[Array, "*batch numbers"]:
     """What eq. 3 takes the norm of: how poses differ from the demonstration's, relative to each cloud's centroid; 12 numbers, or 4 of "metres_radians".
@@ -177,25 +176,25 @@ def pose_difference(
         R, t: poses of the query frame in the world.
         origin: centroid of the new object's cloud, metres, world frame.
         target: the demonstration's, relative to its centroid, `wxyz_xyz`.
-        lever, pose_norm: see `EnergyWeights`.
+        rotation_scale, pose_norm: see `EnergyWeights`.
     """
-    shift = t - origin - se3.translation(target)
+    translation = t - origin - se3.translation(target)
     if pose_norm == "metres_radians":
-        turn = se3.rotation_distance(R, se3.rotation(target))[..., None]
+        rotation = se3.rotation_distance(R, se3.rotation(target))[..., None]
     else:
-        turn = (R - se3.rotation(target)).reshape(*R.shape[:-2], 9)
-    return jnp.concatenate([shift, lever * turn], axis=-1)
+        rotation = (R - se3.rotation(target)).reshape(*R.shape[:-2], 9)
+    return jnp.concatenate([translation, rotation_scale * rotation], axis=-1)
 
 
-def _correlation(R, t, origin, reference, lever, pose_norm):
-    difference = pose_difference(R, t, origin, reference.trajectory.wxyz_xyz, lever, pose_norm)
+def _correlation(R, t, origin, reference, rotation_scale, pose_norm):
+    difference = pose_difference(R, t, origin, reference.trajectory.wxyz_xyz, rotation_scale, pose_norm)
     return jnp.mean(_norm(difference[..., None] if pose_norm == "mean_absolute" else difference))
 
 
 def _compensator(R, t, order):
     # ||T_i^-1 T_{i+1} - I||_F of neighbouring poses: a rotation more on both sides does not change it.
-    turn = (R[1:] - R[:-1]).reshape(-1, 9)
-    lengths = _norm(jnp.concatenate([t[1:] - t[:-1], turn], axis=-1))
+    rotation = (R[1:] - R[:-1]).reshape(-1, 9)
+    lengths = _norm(jnp.concatenate([t[1:] - t[:-1], rotation], axis=-1))
     return jnp.max(lengths) if order == "infinity" else jnp.sum(lengths)
 
 

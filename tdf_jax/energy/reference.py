@@ -42,8 +42,8 @@ def describe(model: Model, demonstrations: Demonstration | Sequence[Demonstratio
         model: the network.
         demonstrations: one, or several with the same query points and number of poses.
         combine: what is taken of several descriptors of a query point, channel by channel: their "mean", as in NDF, or
-            their "median", which has the least sum of the absolute differences that eq. 2 counts (docs/results/benchmark.md
-            compares).
+            their "median", which has the least sum of the absolute differences that eq. 2 counts
+            (docs/results/benchmark.md compares).
 
     Returns:
         The reference.

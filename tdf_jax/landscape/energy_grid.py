@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from tdf_jax._internal.deprecation import renamed_keywords
 from tdf_jax._internal.devices import check_device_mesh
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.reference import Reference
@@ -20,6 +21,7 @@ OVER_ROTATIONS = ("best", "each")
 ORTHOGONAL = 1e-4  # how far R R^T may be from the identity
 
 
+@renamed_keywords(mesh="device_mesh")
 def energy_landscape(
     field: DescriptorField,
     reference: Reference,
@@ -30,7 +32,7 @@ def energy_landscape(
     over_rotations: str = "best",
     temperature: float = TEMPERATURE,
     share: bool = True,
-    mesh: jax.sharding.Mesh | None = None,
+    device_mesh: jax.sharding.Mesh | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Landscape:
     """Sweep the query frame over a grid.
@@ -50,16 +52,16 @@ def energy_landscape(
         over_rotations: of several rotations, keep the "best" at every point and for every waypoint, or "each".
         temperature: of the soft least, in units of the energy.
         share: False evaluates every (grid point, query point) by itself, to compare.
-        mesh: devices to share the grid's tiles, of this process or of several that make the same call; see
+        device_mesh: devices to share the grid's tiles, of this process or of several that make the same call; see
             docs/guide/scaling.md.
         progress: called with the number of tiles done and of all.
 
     Raises:
-        InputError: rotations that are none, an unknown choice, a mesh of another type, or a reference from another
+        InputError: rotations that are none, an unknown choice, a device_mesh of another type, or a reference from another
             network than the field.
     """
     landscape = blank(field, reference, grid, rotation, reduce, over_rotations=over_rotations, temperature=temperature)
-    for done, total in fill(landscape, field, reference, share=share, mesh=mesh):
+    for done, total in fill(landscape, field, reference, share=share, device_mesh=device_mesh):
         if progress is not None:
             progress(done, total)
     return landscape
@@ -112,7 +114,7 @@ def fill(
     done: int = 0,
     *,
     share: bool = True,
-    mesh: jax.sharding.Mesh | None = None,
+    device_mesh: jax.sharding.Mesh | None = None,
 ) -> Iterator[tuple[int, int]]:
     """Sweep a landscape from `blank` in place, tile by tile, so that what is finished can be looked at, kept, and gone on from.
 
@@ -120,12 +122,12 @@ def fill(
         landscape: with the first `done` parts finished.
         field, reference: as it was made with.
         done: parts to leave out, as this function counted them.
-        share, mesh: see `energy_landscape`.
+        share, device_mesh: see `energy_landscape`.
 
     Yields:
         The number of parts done and of all: tiles of the grid, one rotation after the other.
     """
-    check_device_mesh("energy_landscape()", mesh)
+    check_device_mesh("energy_landscape()", device_mesh)
     grid, query = landscape.grid, np.asarray(reference.query, dtype=float)
     found = [shared_lattice.layers(grid, query @ R.T, share) for R in landscape.rotations]
     cover = [shared_lattice.tiles(grid, each.span) for each in found]
@@ -134,7 +136,7 @@ def fill(
     for index, (layers, tiles) in enumerate(zip(found, cover)):
         left = tiles[max(done - before, 0) :]
         before += len(tiles)
-        for tile, values in shared_lattice.swept(field, reference.descriptors, grid, layers, left, mesh):
+        for tile, values in shared_lattice.swept(field, reference.descriptors, grid, layers, left, device_mesh):
             _keep(landscape, index, tile.within(grid.shape), values)
             done += 1
             yield done, total

@@ -150,11 +150,11 @@ def swept(
     grid: Grid,
     found: Layers,
     which: Sequence[Tile],
-    mesh: jax.sharding.Mesh | None = None,
+    device_mesh: jax.sharding.Mesh | None = None,
 ) -> Iterator[tuple[Tile, Float[np.ndarray, " poses *tile"]]]:
     """Energies of every waypoint on tiles, in their order.
 
-    As many tiles are computed at a time as the mesh has devices, one on each; no more is held. Of several processes
+    As many tiles are computed at a time as the device_mesh has devices, one on each; no more is held. Of several processes
     each computes those of its own devices, and all of them get all.
 
     Args:
@@ -163,7 +163,7 @@ def swept(
         grid: the tiles'.
         found: layers of the query points.
         which: from `tiles`.
-        mesh: of devices to share the tiles; jax's default one alone if not given.
+        device_mesh: of devices to share the tiles; jax's default one alone if not given.
     """
     dtype = field.origin.dtype
     channels = descriptors.shape[-1]
@@ -174,9 +174,9 @@ def swept(
     references = np.ascontiguousarray(padded.reshape(len(padded), blocks, UNROLLED, -1).swapaxes(0, 1))
     axes = grid.steps[:, None] * grid.directions
     shared = field, references, axes.astype(dtype), found.shifts.astype(np.int32), found.first.astype(np.int32)
-    mesh = devices.default_device_mesh() if mesh is None else mesh
-    everywhere = NamedSharding(mesh, devices.sharded(mesh))
-    workers = list(mesh.devices.flat)
+    device_mesh = devices.default_device_mesh() if device_mesh is None else device_mesh
+    everywhere = NamedSharding(device_mesh, devices.sharded(device_mesh))
+    workers = list(device_mesh.devices.flat)
     own = [
         (index, jax.device_put(shared, worker))
         for index, worker in enumerate(workers)

@@ -1,8 +1,8 @@
-"""Trajectory optimisation: Adam on SO(3) x R^3, many random starts in one compiled program.
+"""`optimize`: Adam on SO(3) x R^3, many random starts in one compiled program.
 
-The energy is a mean over poses, so (starts x poses) are one list of independent poses. It is walked in chunks, each
-giving its losses and six-number gradients before the next begins: memory does not grow with the number of starts, and
-no more than `chunk` x queries descriptors exist at a time.
+The energy is a mean over poses, so (starts x poses) are one list of independent poses. The list is evaluated in chunks,
+and each chunk yields its losses and six-number gradients before the next begins. So memory does not grow with the
+number of starts, and at most `chunk_poses` x queries descriptors exist at a time.
 """
 
 import dataclasses
@@ -15,8 +15,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from tdf_jax._internal import devices
-from tdf_jax._internal.errors import InputError
+from tdf_jax._internal import checks, devices
+from tdf_jax._internal.deprecation import renamed_fields, renamed_keywords
 from tdf_jax.energy.losses import EnergyWeights, pose_energy, waypoint_loss
 from tdf_jax.energy.reference import Reference
 from tdf_jax.geometry import se3
@@ -24,52 +24,60 @@ from tdf_jax.networks.field import DescriptorField
 from tdf_jax.solvers.initial import STARTS, prepare
 from tdf_jax.solvers.result import Result
 
-# 512 descriptors of 2049 numbers are 4 MB, meant to stay in cache; other sizes were not compared.
+# 512 descriptors of 2049 numbers are 4 MB, which are meant to stay in cache. Other sizes were not compared.
 CHUNK_POINTS = 512
-BLOCK = 20  # iterations of one compiled call: progress and cancellation happen between calls
+BLOCK = 20  # iterations of one compiled call; progress and cancellation happen between calls
 
 
+@renamed_fields(inits="num_starts", chunk="chunk_poses")
 @dataclasses.dataclass(frozen=True)
 class OptimizeConfig:
-    """Settings of the optimiser.
+    """Settings of `optimize`.
 
     Attributes:
-        inits: random starts, M.
-        iterations: Adam steps; the paper uses 100.
-        rotation_rate: Adam's first step size for rotations, radians. The nearest of 10 uniform rotations is 62 degrees
-            from a target on average: 100 steps of NDF's 0.01 would not take it there.
-        translation_rate: the same for translations, metres.
-        final_rate: last step size over the first; the rates fall as a cosine.
-        start: "carried" turns the whole demonstrated trajectory about the object's centroid, by one uniform rotation a
-            start; "scattered" draws each pose on its own, as the paper does: a uniform rotation, and a place uniform in
-            a ball of `start_radius` about the centroid.
-        start_radius: metres, for "scattered".
-        chunk: poses evaluated at a time; None chooses. Changes speed and memory, not the result.
+        num_starts: number of random starts, M in the paper.
+        iterations: number of Adam steps; the paper takes 100.
+        rotation_rate: first step size of Adam for rotations, radians. The nearest of 10 uniform rotations is 62 degrees
+            from a target on average, which 100 steps of NDF's 0.01 would not reach.
+        translation_rate: first step size of Adam for translations, metres.
+        final_rate: ratio of the last step size to the first; the rates decay as a cosine.
+        start: distribution of the starts. "carried" rotates the whole demonstrated trajectory about the object's
+            centroid, by one uniform rotation a start. "scattered" draws each pose on its own, as the paper does: a
+            uniform rotation, and a position uniform in a ball of `start_radius` about the centroid.
+        start_radius: radius of the ball of "scattered", metres.
+        chunk_poses: number of poses that are evaluated at a time; None chooses. It changes speed and memory, not the
+            result.
+
+    Raises:
+        InputError: a setting is out of its range.
     """
 
-    inits: int = 10
+    num_starts: int = 10
     iterations: int = 100
     rotation_rate: float = 0.1
     translation_rate: float = 0.01
     final_rate: float = 0.05
     start: str = "carried"
     start_radius: float = 0.1
-    chunk: int | None = None
+    chunk_poses: int | None = None
 
     def __post_init__(self):
-        for name in ("inits", "iterations", "chunk"):
-            value = getattr(self, name)
-            if value is None and name == "chunk":
-                continue
-            if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
-                raise InputError(f"OptimizeConfig(): {name} is {value!r}; expected a whole number of at least 1")
+        function = "OptimizeConfig()"
+        checks.count(function, "num_starts", self.num_starts)
+        checks.count(function, "iterations", self.iterations)
+        if self.chunk_poses is not None:
+            checks.count(function, "chunk_poses", self.chunk_poses)
         for name in ("rotation_rate", "translation_rate", "final_rate", "start_radius"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise InputError(f"OptimizeConfig(): {name} is {getattr(self, name)}; expected a positive number")
-        if self.start not in STARTS:
-            raise InputError(f"OptimizeConfig(): start is {self.start!r}; expected one of {', '.join(STARTS)}")
+            checks.positive(function, name, getattr(self, name))
+        checks.choice(function, "start", self.start, STARTS)
+
+    @property
+    def num_steps(self) -> int:
+        """Number of steps, which is `iterations`."""
+        return self.iterations
 
 
+@renamed_keywords(mesh="device_mesh")
 def optimize(
     field: DescriptorField,
     reference: Reference,
@@ -79,45 +87,49 @@ def optimize(
     fix_last: bool = True,
     energy: EnergyWeights = EnergyWeights(),
     config: OptimizeConfig = OptimizeConfig(),
-    starts: Float[Array, "inits poses 7"] | None = None,
-    progress: Callable[[int, Float[np.ndarray, " inits"]], None] | None = None,
-    mesh: jax.sharding.Mesh | None = None,
+    starts: Float[Array, "starts poses 7"] | None = None,
+    progress: Callable[[int, Float[np.ndarray, " starts"]], None] | None = None,
+    device_mesh: jax.sharding.Mesh | None = None,
 ) -> Result:
     """Minimise `trajectory_energy` from many starts.
 
-    Each pose turns about the mean of the query points, so that turning does not move them away; results are about the
-    query frame's origin all the same. Start m is a function of the key and m.
+    Each pose rotates about the centroid of the query points, so that a rotation does not move them away. Results are
+    poses of the query frame all the same. Start m is a function of the key and m.
 
     Args:
-        field: the new object's.
-        reference: the demonstration's.
+        field: descriptor field of the new object.
+        reference: the demonstration.
         key: random key of the starts.
-        goal: last pose of every start, T_world_query; by default, if it is kept, the demonstration's, carried by the
-            centroids.
-        fix_last: keep the last pose at the goal; otherwise it is free, and starts at the goal or, without one, at
-            random as the others.
-        energy: weights of the terms.
+        goal: last pose of every start, (7,), T_world_query; by default, with `fix_last`, the demonstration's last pose,
+            moved by the centroids.
+        fix_last: keep the last pose at the goal. Otherwise it is free, and starts at the goal or, without one, at
+            random like the others.
+        energy: weights of the energy's terms.
         config: settings.
-        starts: use these instead of random ones; their last poses are replaced by the goal only where one is given.
-        progress: called between blocks of iterations with the iterations done and the energies; may raise to cancel.
-        mesh: devices to share the starts, of this process or of several that make the same call; see docs/guide/scaling.md.
+        starts: initial trajectories that replace the random ones, (starts, poses, 7), T_world_query. A goal that is
+            given replaces their last poses.
+        progress: function that is called between blocks of iterations with the number of iterations so far and the
+            energies. It may raise to cancel.
+        device_mesh: devices that share the starts, of this process or of several that make the same call.
 
     Returns:
-        All starts' results.
+        The result; its candidates are all starts, in their order.
 
     Raises:
-        InputError: starts, goal, weights or mesh of a wrong shape, type or value, a reference from another network than
-            the field, or nothing to move: one pose, and that kept.
+        InputError: starts, goal, weights or device mesh of a wrong shape, type or value, a reference from another
+            network than the field, or one pose that is kept, so that nothing can move.
     """
-    starts, energy = prepare("optimize()", field, reference, key, goal, fix_last, energy, config, starts, mesh)
-    inits, dtype = len(starts), starts.dtype
+    starts, energy = prepare(
+        "optimize()", field, reference, key, goal, fix_last, energy, config, starts, device_mesh, config.num_starts
+    )
+    num_starts, dtype = len(starts), starts.dtype
     starts = jnp.asarray(starts)
-    count = config.chunk or max(1, devices.points_at_a_time(CHUNK_POINTS) // len(reference.query))
-    program = functools.partial(_run, fix_last=fix_last, chunk=count, mesh=mesh)
+    count = config.chunk_poses or max(1, devices.points_at_a_time(CHUNK_POINTS) // len(reference.query))
+    program = functools.partial(_run, fix_last=fix_last, chunk=count, device_mesh=device_mesh)
     rates = np.array([config.rotation_rate, config.translation_rate, config.final_rate, config.iterations], dtype)
-    if mesh is not None:
-        starts = devices.placed(devices.padded(starts, mesh), mesh, devices.sharded(mesh))
-        field, reference, energy, rates = devices.placed((field, reference, energy, rates), mesh)
+    if device_mesh is not None:
+        starts = devices.placed(devices.padded(starts, device_mesh), device_mesh, devices.sharded(device_mesh))
+        field, reference, energy, rates = devices.placed((field, reference, energy, rates), device_mesh)
     state = _begin(starts, reference.query)
     losses = []
     for done in range(0, config.iterations, BLOCK):
@@ -125,37 +137,41 @@ def optimize(
         state, block = program(state, starts, field, reference, energy, rates, steps)
         losses.append(block[:, :steps])
         if progress is not None:
-            progress(done + steps, devices.gathered(block)[:inits, steps - 1])
+            progress(done + steps, devices.gathered(block)[:num_starts, steps - 1])
     trajectories = _trajectories(state, starts, reference.query, fix_last=fix_last)
     # One more step, not kept: the energies after the last one, by the program that is compiled already.
     _, block = program(state, starts, field, reference, energy, rates, 1)
-    result = Result(trajectories, jnp.concatenate(losses, axis=1), block[:, 0], starts)
-    return result if mesh is None else jax.tree.map(lambda part: jnp.asarray(devices.gathered(part)[:inits]), result)
+    history = jnp.concatenate(losses, axis=1)
+    result = Result(trajectories, block[:, 0], history, starts, history)
+    if device_mesh is None:
+        return result
+    # Fields that are unknown are scalars of this process.
+    return jax.tree.map(lambda part: jnp.asarray(devices.gathered(part)[:num_starts]) if part.ndim else part, result)
 
 
 @jax.jit
 def _begin(starts, query):
-    """The optimiser's state: the variables (rotation vectors away from the starts, places of the query centroid), Adam's moments, steps done."""
-    places = se3.transform(starts, jnp.mean(query, axis=0)[None])[..., 0, :]
-    variables = (jnp.zeros_like(places), places)
+    """The optimiser's state: the variables (rotation vectors away from the starts, centroids of the query centroid), Adam's moments, steps done."""
+    centroids = se3.transform(starts, jnp.mean(query, axis=0)[None])[..., 0, :]
+    variables = (jnp.zeros_like(centroids), centroids)
     return variables, optax.scale_by_adam().init(variables), jnp.zeros((), jnp.int32)
 
 
 def _poses(variables, start_rotations, query):
     """Rotations and translations (of the query frame's origin) of the variables."""
-    turn, place = variables
-    R = se3.multiply(se3.exp(turn), start_rotations)
-    return R, place - se3.rotate(R, jnp.mean(query, axis=0)[None])[..., 0, :]
+    rotation_vector, centroid = variables
+    R = se3.multiply(se3.exp(rotation_vector), start_rotations)
+    return R, centroid - se3.rotate(R, jnp.mean(query, axis=0)[None])[..., 0, :]
 
 
-@functools.partial(jax.jit, static_argnames=("fix_last", "chunk", "mesh"), donate_argnums=0)
-def _run(state, starts, field, reference, energy, rates, steps, *, fix_last, chunk, mesh=None):
+@functools.partial(jax.jit, static_argnames=("fix_last", "chunk", "device_mesh"), donate_argnums=0)
+def _run(state, starts, field, reference, energy, rates, steps, *, fix_last, chunk, device_mesh=None):
     work = functools.partial(_steps, fix_last=fix_last, chunk=chunk)
-    if mesh is not None:
-        split, whole = devices.sharded(mesh), devices.REPLICATED
+    if device_mesh is not None:
+        split, whole = devices.sharded(device_mesh), devices.REPLICATED
         states = split, optax.ScaleByAdamState(whole, split, split), whole
         work = jax.shard_map(
-            work, mesh=mesh, in_specs=(states, split, *[whole] * 5), out_specs=(states, split), check_vma=False
+            work, mesh=device_mesh, in_specs=(states, split, *[whole] * 5), out_specs=(states, split), check_vma=False
         )
     return work(state, starts, field, reference, energy, rates, steps)
 
@@ -190,7 +206,7 @@ def _evaluator(starts, field, reference, energy, fix_last, chunk):
     Equal to `jax.vmap(jax.value_and_grad(trajectory_energy))`, but a chunk of poses at a time. A fixed last pose is
     evaluated once a call, not in every step, and has gradient zero.
     """
-    inits, n = starts.shape[:2]
+    num_starts, n = starts.shape[:2]
     free = n - 1 if fix_last else n
     query = reference.query
 
@@ -209,23 +225,23 @@ def _evaluator(starts, field, reference, energy, fix_last, chunk):
         fixed = jax.lax.map(lambda pose: waypoint_loss(*pose, field, query, reference.descriptors[-1]), last)
 
     def flat(x):
-        return x[:, :free].reshape(inits * free, *x.shape[2:])
+        return x[:, :free].reshape(num_starts * free, *x.shape[2:])
 
     def unflat(gradient):
-        gradient = gradient.reshape(inits, free, 3) / n
-        return jnp.concatenate([gradient, jnp.zeros((inits, n - free, 3), gradient.dtype)], axis=1)
+        gradient = gradient.reshape(num_starts, free, 3) / n
+        return jnp.concatenate([gradient, jnp.zeros((num_starts, n - free, 3), gradient.dtype)], axis=1)
 
     def rest(variables, start_rotation):
         return pose_energy(*_poses(variables, start_rotation, query), field.origin, reference, energy)
 
     def evaluate(variables):
-        indices = jnp.tile(jnp.arange(free), inits)
+        indices = jnp.tile(jnp.arange(free), num_starts)
         inputs = (jax.tree.map(flat, variables), flat(start_rotations), indices)
         # One pose at a time is mapped plainly: a batch of one took 15 ms a pose of 500 query points instead of 8.5.
         losses, gradient = jax.lax.map(indexed, inputs, batch_size=chunk if chunk > 1 else None)
         remaining, remaining_gradient = jax.vmap(jax.value_and_grad(rest))(variables, start_rotations)
         mask = (jnp.arange(n) < free)[:, None]
         gradient = jax.tree.map(lambda a, b: unflat(a) + jnp.where(mask, b, 0.0), gradient, remaining_gradient)
-        return (losses.reshape(inits, free).sum(axis=1) + fixed) / n + remaining, gradient
+        return (losses.reshape(num_starts, free).sum(axis=1) + fixed) / n + remaining, gradient
 
     return evaluate

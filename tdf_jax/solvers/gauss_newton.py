@@ -1,4 +1,4 @@
-"""Damped Gauss-Newton steps on single poses, each with the waypoint that it is to match.
+"""Damped Gauss-Newton steps on single poses, each of which matches one waypoint.
 
 A step solves (H + damping diag(H)) delta = -gradient for each pose. The gradient is the energy's own; H is that of the
 absolute values replaced by r^2 / (2 max(|r|, s)), with s the mean |r| of the query point: iteratively reweighted least
@@ -18,22 +18,22 @@ from tdf_jax.energy.losses import pose_difference
 from tdf_jax.energy.reference import Reference
 from tdf_jax.geometry import se3
 
-LARGEST_TURN, LARGEST_MOVE = 0.7, 0.05  # radians and metres of one step
-DAMPINGS = 1e-3, 1e3  # least and greatest
-ACCEPTED, REJECTED = 0.3, 4.0  # factors on the damping
-# metres; the curvature of eq. 3's norm grows without bound towards zero: that of no smaller difference is taken
+LARGEST_ROTATION, LARGEST_TRANSLATION = 0.7, 0.05  # bounds of one step, radians and metres
+DAMPINGS = 1e-3, 1e3  # bounds of the damping
+ACCEPTED, REJECTED = 0.3, 4.0  # factors on the damping after a step
+# Metres. The curvature of eq. 3's norm grows without bound towards zero, so no smaller difference enters it.
 LEAST_DIFFERENCE = 1e-4
 
 
 class Problem(NamedTuple):
-    """What poses are to match, with the query points in blocks: a stage sees the first, or all.
+    """What the poses match. The query points lie in blocks, of which a stage evaluates the first or all.
 
     Attributes:
-        query: relative to their mean, (blocks, size, 3), metres.
-        weights: 1, or 0 for what fills up the last block, (blocks, size).
-        descriptors: the demonstration's.
-        target: waypoints of the reference, `wxyz_xyz`, relative to the object's origin.
-        centre: mean of the query points, in the query frame.
+        query: query points relative to their centroid, (blocks, size, 3), metres, query frame.
+        weights: 1 for a query point, 0 for padding of the last block, (blocks, size).
+        descriptors: descriptors of the demonstration, (waypoints, blocks, size, channels).
+        target: waypoints of the reference, (waypoints, 7), `wxyz_xyz`, relative to the object's origin.
+        centre: centroid of the query points, (3,), metres, query frame.
     """
 
     query: Float[Array, "blocks size 3"]
@@ -45,12 +45,15 @@ class Problem(NamedTuple):
 
 @functools.partial(jax.jit, compiler_options=devices.FAST_COMPILATION)
 def in_blocks(reference: Reference, order: Int[Array, "blocks size"], counts: Bool[Array, "blocks size"]) -> Problem:
-    """A reference's query points in blocks.
+    """Arrange the query points of a reference in blocks.
 
     Args:
-        reference: the demonstration's.
-        order: numbers of the query points.
-        counts: where False, one only fills up the last block.
+        reference: the demonstration.
+        order: indices of the query points, (blocks, size).
+        counts: False for padding of the last block, (blocks, size).
+
+    Returns:
+        The problem.
     """
     query, descriptors = reference.query, reference.descriptors
     centre = jnp.mean(query, axis=0)
@@ -64,50 +67,56 @@ def in_blocks(reference: Reference, order: Int[Array, "blocks size"], counts: Bo
 
 
 class _State(NamedTuple):
-    """Poses, each apart from the others, with its energy and the quadratic model of it.
+    """Independent poses, their energies, and the quadratic models of these.
 
-    `gradient` and `hessian` are with respect to a turn about the query points' mean (on the left) and a move.
+    `gradient` and `hessian` are with respect to a rotation about the query points' centroid, applied on the left, and a
+    translation.
     """
 
     R: Float[Array, "poses 3 3"]
-    place: Float[Array, "poses 3"]
+    centroid: Float[Array, "poses 3"]
     energy: Float[Array, " poses"]
     gradient: Float[Array, "poses 6"]
     hessian: Float[Array, "poses 6 6"]
 
 
-@functools.partial(jax.jit, static_argnames=("length", "chunk", "mesh"))
-def descend(R, place, waypoint, bounds, damping, tolerance, field, problem, energy, *, length, chunk, mesh=None):
-    """Damped Gauss-Newton steps, until none promises to gain by the tolerance.
+@functools.partial(jax.jit, static_argnames=("length", "chunk", "device_mesh"))
+def descend(
+    R, centroid, waypoint, bounds, damping, tolerance, field, problem, energy, *, length, chunk, device_mesh=None
+):
+    """Take damped Gauss-Newton steps until no pose promises to gain more than the tolerance.
 
     Args:
-        R, place: rotations of the query frame in the world, (poses, 3, 3), and places of the query points' mean,
-            (poses, 3), metres.
-        waypoint: of each pose, what it is to match.
-        bounds: how many of the poses move, how many are evaluated, blocks of query points, most steps.
-        damping: of the first step.
-        tolerance: share of a pose's energy that its next step has to promise; where none does, all end.
-        field, problem, energy: what is minimised.
-        length: times a history has room for.
-        chunk: query points evaluated at a time.
-        mesh: devices that the poses are dealt out to in turns.
+        R, centroid: rotations of the query frame in the world, (poses, 3, 3), and positions of the query points'
+            centroid, (poses, 3), metres, world frame.
+        waypoint: index of the waypoint that each pose matches, (poses,).
+        bounds: number of poses that move, number of poses that are evaluated, number of blocks of query points, and
+            maximal number of steps, (4,).
+        damping: damping of the first step.
+        tolerance: share of a pose's energy that its next step has to promise; the loop ends when no pose promises it.
+        field, problem, energy: field, problem and weights that define the energy.
+        length: number of entries of a history.
+        chunk: number of query points that are evaluated at a time.
+        device_mesh: devices that share the poses, dealt out in turn.
 
     Returns:
-        R, place, and energies at the start and after each step, (poses, length); those of steps that were not taken are
-        the latest.
+        R, centroid, and energies at the start and after each step, (poses, length); steps that were not taken repeat
+        the last energy.
     """
-    work = functools.partial(_steps, length=length, chunk=chunk, axes=mesh.axis_names if mesh is not None else ())
-    if mesh is not None:
-        split = devices.sharded(mesh)
+    work = functools.partial(
+        _steps, length=length, chunk=chunk, axes=device_mesh.axis_names if device_mesh is not None else ()
+    )
+    if device_mesh is not None:
+        split = devices.sharded(device_mesh)
         work = jax.shard_map(
-            work, mesh=mesh, in_specs=(*[split] * 3, *[devices.REPLICATED] * 6), out_specs=split, check_vma=False
+            work, mesh=device_mesh, in_specs=(*[split] * 3, *[devices.REPLICATED] * 6), out_specs=split, check_vma=False
         )
-    return work(R, place, waypoint, bounds, damping, tolerance, field, problem, energy)
+    return work(R, centroid, waypoint, bounds, damping, tolerance, field, problem, energy)
 
 
 @full_precision
-def _steps(R, place, waypoint, bounds, damping, tolerance, field, problem, energy, *, length, chunk, axes):
-    """`descend` on one device; `axes` are the mesh's."""
+def _steps(R, centroid, waypoint, bounds, damping, tolerance, field, problem, energy, *, length, chunk, axes):
+    """`descend` on one device; `axes` names the axes of the device mesh."""
     if axes:
         parts, part = jax.lax.axis_size(axes), jax.lax.axis_index(axes)
         # of the poses dealt out, those of this device
@@ -117,8 +126,8 @@ def _steps(R, place, waypoint, bounds, damping, tolerance, field, problem, energ
 
     def body(carry):
         i, state, damping, step, _, history = carry
-        R, place = se3.multiply(se3.exp(step[:, :3]), state.R), state.place + step[:, 3:]
-        trial = _State(R, place, *_evaluate(R, place, waypoint, bounds, field, problem, energy, chunk))
+        R, centroid = se3.multiply(se3.exp(step[:, :3]), state.R), state.centroid + step[:, 3:]
+        trial = _State(R, centroid, *_evaluate(R, centroid, waypoint, bounds, field, problem, energy, chunk))
         # The first time nothing has moved and the state's energies are infinite: it takes what is finite.
         better = trial.energy < state.energy
         state = jax.tree.map(lambda a, b: jnp.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b), trial, state)
@@ -136,10 +145,10 @@ def _steps(R, place, waypoint, bounds, damping, tolerance, field, problem, energ
         jnp.zeros((count, 6), dtype),
         jnp.broadcast_to(jnp.eye(6, dtype=dtype), (count, 6, 6)),
     )
-    begin = _State(R, place, *values), jnp.full(count, damping, dtype), jnp.zeros((count, 6), dtype)
+    begin = _State(R, centroid, *values), jnp.full(count, damping, dtype), jnp.zeros((count, 6), dtype)
     carry = (jnp.int32(0), *begin, jnp.bool_(True), jnp.zeros((count, length), dtype))
     _, state, _, _, _, history = jax.lax.while_loop(lambda carry: (carry[0] <= steps) & carry[4], body, carry)
-    return state.R, state.place, history
+    return state.R, state.centroid, history
 
 
 def _step(state, damping):
@@ -148,8 +157,8 @@ def _step(state, damping):
     # Far from the object a field is flat: the floor keeps the system solvable.
     damped = state.hessian + (damping[:, None] * diagonal + 1e-9)[:, :, None] * jnp.eye(6, dtype=diagonal.dtype)
     step = -_solved(damped, state.gradient)
-    turn, move = (jnp.linalg.norm(part, axis=-1) for part in (step[:, :3], step[:, 3:]))
-    longest = jnp.maximum(jnp.maximum(turn / LARGEST_TURN, move / LARGEST_MOVE), 1.0)
+    rotation, translation = (jnp.linalg.norm(part, axis=-1) for part in (step[:, :3], step[:, 3:]))
+    longest = jnp.maximum(jnp.maximum(rotation / LARGEST_ROTATION, translation / LARGEST_TRANSLATION), 1.0)
     step = step / longest[:, None]
     curved = jnp.sum(step * jnp.sum(state.hessian * step[:, None], axis=-1), axis=-1)
     return step, -jnp.sum(state.gradient * step, axis=-1) - curved / 2
@@ -165,7 +174,7 @@ def _solved(matrix, right):
     return jax.lax.fori_loop(0, 6, eliminate, jnp.concatenate([matrix, right[..., None]], axis=-1))[..., -1]
 
 
-def _evaluate(R, place, waypoint, bounds, field, problem, energy, chunk):
+def _evaluate(R, centroid, waypoint, bounds, field, problem, energy, chunk):
     """Energies of the poses within the bounds and their quadratic models: (poses,), (poses, 6), (poses, 6, 6)."""
     _, last, blocks, _ = bounds
     count = min(max(1, chunk // problem.query.shape[1]), len(R))
@@ -174,11 +183,13 @@ def _evaluate(R, place, waypoint, bounds, field, problem, energy, chunk):
     def some(j, values):
         # The last chunk begins early rather than run over the end.
         begin = jnp.minimum(j * count, len(R) - count)
-        R_, place_, waypoint_ = (jax.lax.dynamic_slice_in_dim(part, begin, count) for part in (R, place, waypoint))
+        R_, centroid_, waypoint_ = (
+            jax.lax.dynamic_slice_in_dim(part, begin, count) for part in (R, centroid, waypoint)
+        )
 
         def block(b, total):
             terms = _match(
-                R_, place_, field, problem.query[b], problem.weights[b] / used, problem.descriptors[waypoint_, b]
+                R_, centroid_, field, problem.query[b], problem.weights[b] / used, problem.descriptors[waypoint_, b]
             )
             return jax.tree.map(jnp.add, total, terms)
 
@@ -189,14 +200,14 @@ def _evaluate(R, place, waypoint, bounds, field, problem, energy, chunk):
 
     values = tuple(jnp.zeros((len(R), *shape), R.dtype) for shape in ((), (6,), (6, 6)))
     values = jax.lax.fori_loop(0, (last + count - 1) // count, some, values)
-    prior = jax.vmap(lambda R, place, target: _prior(R, place, target, field.origin, problem.centre, energy))
-    return jax.tree.map(jnp.add, values, prior(R, place, problem.target[waypoint]))
+    prior = jax.vmap(lambda R, centroid, target: _prior(R, centroid, target, field.origin, problem.centre, energy))
+    return jax.tree.map(jnp.add, values, prior(R, centroid, problem.target[waypoint]))
 
 
-def _match(R, place, field, query, weights, shown):
+def _match(R, centroid, field, query, weights, shown):
     """Weighted sums over query points of the mean absolute difference of descriptors, its gradient and its model's curvature."""
     arm = se3.rotate(R, query)
-    x = (arm + place[:, None]).reshape(-1, 3)
+    x = (arm + centroid[:, None]).reshape(-1, 3)
 
     def along(axis):
         return jax.jvp(field.descriptors, (x,), (jnp.broadcast_to(axis, x.shape),))
@@ -213,7 +224,7 @@ def _match(R, place, field, query, weights, shown):
     curvature = jnp.einsum("pic,pjc->pij", tangents, weighted)
 
     slope, curvature = slope.reshape(*arm.shape[:2], 3), curvature.reshape(*arm.shape[:2], 3, 3)
-    # A turn w moves a point by w x arm, a move v by v: rows of the jacobian (poses, size, 6, 3).
+    # A rotation w moves a point by w x arm, a translation v by v: rows of the jacobian (poses, size, 6, 3).
     identity = jnp.broadcast_to(jnp.eye(3, dtype=x.dtype), curvature.shape)
     jacobian = jnp.concatenate([jnp.cross(identity, arm[..., None, :]), identity], axis=-2)
     gradient = jnp.einsum("pqai,pqi->pa", jacobian, slope)
@@ -221,17 +232,17 @@ def _match(R, place, field, query, weights, shown):
     return jnp.sum((weights * mean).reshape(arm.shape[:2]), axis=1), gradient, hessian
 
 
-def _prior(R, place, target, origin, centre, energy):
+def _prior(R, centroid, target, origin, centre, energy):
     """One pose's weighted part of eq. 3, its gradient and its model's curvature."""
 
-    def difference(R, place):
-        return pose_difference(R, place - R @ centre, origin, target, energy.lever, energy.pose_norm)
+    def difference(R, centroid):
+        return pose_difference(R, centroid - R @ centre, origin, target, energy.rotation_scale, energy.pose_norm)
 
-    # Along a turn about each axis, which changes R by axis x R, and a move along each.
+    # Along a rotation about each axis, which changes R by axis x R, and a translation along each.
     identity, zeros = jnp.eye(3, dtype=R.dtype), jnp.zeros((3, 3), R.dtype)
-    turns = jnp.cross(identity[:, None], R.T[None]).swapaxes(1, 2)
-    along = jnp.concatenate([turns, jnp.zeros_like(turns)]), jnp.concatenate([zeros, identity])
-    value, rows = jax.vmap(lambda *step: jax.jvp(difference, (R, place), step), out_axes=(None, 0))(*along)
+    rotations = jnp.cross(identity[:, None], R.T[None]).swapaxes(1, 2)
+    along = jnp.concatenate([rotations, jnp.zeros_like(rotations)]), jnp.concatenate([zeros, identity])
+    value, rows = jax.vmap(lambda *step: jax.jvp(difference, (R, centroid), step), out_axes=(None, 0))(*along)
     if energy.pose_norm == "mean_absolute":
         length, share = jnp.abs(value), energy.correlation / len(value)
         loss = share * jnp.sum(length)

@@ -27,14 +27,20 @@ def prepare(
     fix_last: bool,
     energy: EnergyWeights,
     config,
-    starts: Float[Array, "inits poses 7"] | None,
-    mesh: jax.sharding.Mesh | None,
-) -> tuple[Float[np.ndarray, "inits poses 7"], EnergyWeights]:
-    """Checked starts, which end at the goal if there is one, and weights of the same type; see `optimize`.
+    starts: Float[Array, "starts poses 7"] | None,
+    device_mesh: jax.sharding.Mesh | None,
+    num_starts: int,
+) -> tuple[Float[np.ndarray, "starts poses 7"], EnergyWeights]:
+    """Check or draw the starts, end them at the goal if there is one, and give the weights the type of the starts.
 
     Args:
-        function: name for messages.
-        config: with `inits`, `start` and `start_radius`.
+        function: name that begins the messages.
+        field, reference, key, goal, fix_last, energy, starts, device_mesh: see `optimize`.
+        config: settings with the fields `start` and `start_radius`.
+        num_starts: number of random starts, if none are given.
+
+    Returns:
+        Initial trajectories, T_world_query, and the weights.
 
     Raises:
         InputError: as for `optimize`.
@@ -43,7 +49,7 @@ def prepare(
         raise InputError(
             f"{function}: energy is {energy!r}; expected EnergyWeights, such as EnergyWeights(correlation=0.02)"
         )
-    devices.check_device_mesh(function, mesh)
+    devices.check_device_mesh(function, device_mesh)
     if fix_last and reference.trajectory.num_poses == 1:
         raise InputError(f"{function}: the trajectory has one pose and fix_last keeps it; expected fix_last=False")
     channels = field.conditioned.config.channels
@@ -55,16 +61,16 @@ def prepare(
     if starts is None:
         checks.key(function, key)
         goal = default_goal(field, reference) if goal is None and fix_last else goal
-        starts = random_starts(key, field, reference, config.inits, config.start, config.start_radius)
+        starts = random_starts(key, field, reference, num_starts, config.start, config.start_radius)
     if goal is not None:
-        check_goal(function, goal)
+        checks.pose(function, "goal", goal)
     starts = np.asarray(starts)
     if starts.ndim != 3 or starts.shape[1:] != (reference.trajectory.num_poses, 7):
         raise InputError(
-            f"{function}: starts have shape {starts.shape}; expected (inits, {reference.trajectory.num_poses}, 7), "
+            f"{function}: starts have shape {starts.shape}; expected (starts, {reference.trajectory.num_poses}, 7), "
             "as many poses as the demonstration has"
         )
-    # One type of every traced number: mixed ones promote, and a weight of 0 for 0.02 would compile again.
+    # Every traced number gets one type. Mixed types promote, and a weight of 0 instead of 0.02 would compile again.
     dtype = jnp.result_type(starts, reference.query, reference.descriptors, field.latent)
     _check_weights(function, energy)
     energy = jax.tree.map(lambda weight: jnp.asarray(weight, dtype), energy)
@@ -76,51 +82,53 @@ def prepare(
 
 
 def default_goal(field: DescriptorField, reference: Reference) -> Float[Array, "7"]:
-    """The demonstration's last pose, carried by the centroids."""
+    """The demonstration's last pose, moved from the demonstration's centroid to the field's origin, T_world_query."""
     return reference.trajectory.shifted(field.origin).wxyz_xyz[-1]
 
 
 def _check_weights(function, energy):
-    # Here, not where they are made: a gradient with respect to the weights is an EnergyWeights too, and may be
-    # negative.
-    for name in ("correlation", "compensator", "lever"):
-        value = getattr(energy, name)
-        if not isinstance(value, jax.core.Tracer) and not (np.ndim(value) == 0 and 0 <= float(value) < np.inf):
-            raise InputError(f"{function}: energy.{name} is {value}; expected one finite number of 0 or more")
-
-
-def check_goal(function: str, goal: Float[Array, "7"]) -> None:
-    """Raise InputError unless a goal is one finite pose."""
-    values = np.asarray(goal)
-    if values.shape != (7,) or not np.isfinite(values).all() or not values[:4].any():
-        raise InputError(
-            f"{function}: goal of shape {values.shape} is {values}; expected one finite pose wxyz_xyz, (7,), "
-            "its quaternion not zero"
-        )
+    # The check is here and not in the constructor: a gradient with respect to the weights is an EnergyWeights too, and
+    # may be negative.
+    for name in ("correlation", "compensator", "rotation_scale"):
+        checks.number(function, f"energy.{name}", getattr(energy, name), least=0)
 
 
 def random_starts(
-    key: PRNGKeyArray, field: DescriptorField, reference: Reference, inits: int, start: str, radius: float
-) -> Float[Array, "inits poses 7"]:
-    """Random trajectories in the world; start m depends on the key and m alone. See `OptimizeConfig`."""
-    return _random_starts(key, field.origin, reference, radius, inits=inits, start=start)
+    key: PRNGKeyArray, field: DescriptorField, reference: Reference, num_starts: int, start: str, radius: float
+) -> Float[Array, "starts poses 7"]:
+    """Draw initial trajectories; start m is a function of the key and m alone.
+
+    Args:
+        key: random key.
+        field: field of the new object; trajectories are drawn about its origin.
+        reference: the demonstration.
+        num_starts: number of starts.
+        start, radius: see `start` and `start_radius` of `OptimizeConfig`.
+
+    Returns:
+        Trajectories, T_world_query, metres.
+    """
+    return _random_starts(key, field.origin, reference, radius, num_starts=num_starts, start=start)
 
 
-@functools.partial(jax.jit, static_argnames=("inits", "start"), compiler_options=devices.FAST_COMPILATION)
-def _random_starts(key, origin, reference, radius, *, inits, start):
-    return jax.vmap(lambda m: _start(jax.random.fold_in(key, m), origin, reference, start, radius))(jnp.arange(inits))
+@functools.partial(jax.jit, static_argnames=("num_starts", "start"), compiler_options=devices.FAST_COMPILATION)
+def _random_starts(key, origin, reference, radius, *, num_starts, start):
+    def draw(m):
+        return _start(jax.random.fold_in(key, m), origin, reference, start, radius)
+
+    return jax.vmap(draw)(jnp.arange(num_starts))
 
 
 def _start(key, origin, reference, start, radius):
     n, dtype = reference.trajectory.num_poses, reference.trajectory.wxyz_xyz.dtype
-    turn_key, way_key, far_key = jax.random.split(key, 3)
+    rotation_key, direction_key, distance_key = jax.random.split(key, 3)
     if start == "carried":
-        turn = se3.uniform_rotations(turn_key, 1)[0].astype(dtype)
-        return reference.trajectory.transformed(se3.pose(turn, origin)).wxyz_xyz
+        rotation = se3.uniform_rotations(rotation_key, 1)[0].astype(dtype)
+        return reference.trajectory.transformed(se3.pose(rotation, origin)).wxyz_xyz
     # Uniform in the ball; `jax.random.ball` takes 2 s to compile.
-    way = jax.random.normal(way_key, (n, 3), dtype)
-    far = radius * jnp.cbrt(jax.random.uniform(far_key, (n, 1), dtype))
-    place = far * way / jnp.linalg.norm(way, axis=-1, keepdims=True)
-    R = se3.uniform_rotations(turn_key, n).astype(dtype)
-    centre = jnp.mean(reference.query, axis=0)
-    return se3.pose(R, origin + place - se3.rotate(R, centre[None])[:, 0])
+    direction = jax.random.normal(direction_key, (n, 3), dtype)
+    distance = radius * jnp.cbrt(jax.random.uniform(distance_key, (n, 1), dtype))
+    offset = distance * direction / jnp.linalg.norm(direction, axis=-1, keepdims=True)
+    R = se3.uniform_rotations(rotation_key, n).astype(dtype)
+    centroid = jnp.mean(reference.query, axis=0)
+    return se3.pose(R, origin + offset - se3.rotate(R, centroid[None])[:, 0])

@@ -1,9 +1,9 @@
-"""The demonstration carried to a new object: its pick found by descriptors, the way to the goal turned evenly.
+"""`carry`: the pick is found by descriptors, and the demonstration is warped from there to the goal.
 
-Eq. 3 of the paper holds every waypoint near the demonstration's pose in the world, and its descriptors pull every
-waypoint along with the object: where object and goal moved differently the two disagree, waypoint by waypoint. Here
-descriptors find one motion, that of the pick, and the goal gives the other; each waypoint is carried by what lies
-between them (docs/results/benchmark.md compares).
+Eq. 3 of the paper holds every waypoint near the demonstration's pose in the world, while its descriptors pull every
+waypoint along with the object. Where object and goal move differently, the two disagree at every waypoint. Here
+descriptors determine one motion, that of the pick, and the goal determines the other; the waypoints between follow
+both.
 """
 
 import dataclasses
@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.deprecation import renamed_fields, renamed_keywords
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference
@@ -22,56 +23,70 @@ from tdf_jax.energy.residual import pick_residual
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.geometry.transport import carry_to_picks
 from tdf_jax.networks.field import DescriptorField
-from tdf_jax.solvers.initial import check_goal, default_goal
-from tdf_jax.solvers.multistart import SolveConfig, solve
+from tdf_jax.solvers.initial import default_goal
+from tdf_jax.solvers.multistart import SolveConfig, check_stage_settings, solve
 from tdf_jax.solvers.result import Result
 
 
+@renamed_fields(
+    scouts="num_starts",
+    finalists="num_candidates",
+    points="num_coarse_queries",
+    chunk="chunk_queries",
+    steps=("coarse_steps", "prune_steps", "refine_steps", "polish_steps"),
+)
 @dataclasses.dataclass(frozen=True)
 class CarryConfig:
     """Settings of `carry`: those of the solver that finds the pick.
 
     Attributes:
-        scouts: random starts.
-        finalists: candidates that are kept to the end, the rows of the result; several may come to one pose, see
-            `cluster_poses`.
-        points: query points that all stages but the last see, drawn at random from all.
-        steps: most steps of the four stages: from all scouts, from the best quarter of them, of the finalists, and of
-            these with all query points. The last are many, so that the finalists tell how many distinct solutions there
-            are: after four some are 5 to 90 degrees from their minima.
-        tolerance, start, start_radius, chunk: see `SolveConfig`.
+        num_starts: number of random starts of the pick.
+        num_candidates: number of candidates that are refined and polished, the rows of the result. Several may converge
+            to one pose, see `cluster_poses`.
+        num_coarse_queries: number of query points that all stages but the last evaluate, drawn at random.
+        coarse_steps: maximal number of steps from every start.
+        prune_steps: maximal number of steps of the best quarter of the starts.
+        refine_steps: maximal number of steps of the candidates.
+        polish_steps: maximal number of steps of the candidates with all query points. They are many, so that the
+            candidates converge and show how many distinct solutions there are: after four steps some are 5 to 90
+            degrees from their minima.
+        tolerance: see `SolveConfig`.
+        start: distribution of the starts, see `OptimizeConfig`.
+        start_radius: radius of the starts, metres, see `OptimizeConfig`.
+        chunk_queries: see `SolveConfig`.
+
+    Raises:
+        InputError: a setting is out of its range.
     """
 
-    scouts: int = 64
-    finalists: int = 5
-    points: int = 16
-    steps: tuple[int, int, int, int] = (6, 10, 6, 24)
+    num_starts: int = 64
+    num_candidates: int = 5
+    num_coarse_queries: int = 16
+    coarse_steps: int = 6
+    prune_steps: int = 10
+    refine_steps: int = 6
+    polish_steps: int = 24
     tolerance: float = 1e-3
     start: str = "carried"
     start_radius: float = 0.1
-    chunk: int | None = None
+    chunk_queries: int | None = None
 
     def __post_init__(self):
-        if not isinstance(self.steps, tuple) or len(self.steps) != 4:
-            raise InputError(
-                f"CarryConfig(): steps is {self.steps!r}; expected a tuple of four whole numbers of at least 1"
-            )
-        try:
-            self.solver
-        except InputError as error:
-            raise InputError(str(error).replace("SolveConfig()", "CarryConfig()").replace("six", "four")) from None
+        check_stage_settings("CarryConfig()", self)
+
+    @property
+    def num_steps(self) -> int:
+        """Maximal number of steps of all stages together."""
+        return self.coarse_steps + self.prune_steps + self.refine_steps + self.polish_steps
 
     @property
     def solver(self) -> SolveConfig:
-        """The solver's settings: of one waypoint it makes no search of whole trajectories, and carries none."""
-        scout, halve, refine, polish = self.steps
-        settings = {
-            name: getattr(self, name)
-            for name in ("scouts", "finalists", "points", "tolerance", "start", "start_radius", "chunk")
-        }
-        return SolveConfig(inits=1, steps=(scout, halve, 1, 1, refine, polish), **settings)
+        """The settings for `solve`, which neither searches nor propagates where there is one waypoint."""
+        settings = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return SolveConfig(num_trajectory_starts=1, search_steps=1, propagate_steps=1, **settings)
 
 
+@renamed_keywords(mesh="device_mesh")
 def carry(
     field: DescriptorField,
     reference: Reference,
@@ -80,23 +95,23 @@ def carry(
     goal: Float[Array, "7"] | None = None,
     fix_last: bool = True,
     config: CarryConfig = CarryConfig(),
-    progress: Callable[[int, Float[np.ndarray, " finalists"]], None] | None = None,
-    mesh: jax.sharding.Mesh | None = None,
+    progress: Callable[[int, Float[np.ndarray, " candidates"]], None] | None = None,
+    device_mesh: jax.sharding.Mesh | None = None,
 ) -> Result:
-    """Find the pick by its descriptors (eq. 2 of one waypoint) and carry the demonstration from there to the goal.
+    """Find the pick by its descriptors (eq. 2 of one waypoint) and warp the demonstration from there to the goal.
 
     Args:
-        field: the new object's.
-        reference: the demonstration's.
-        key: random key of the starts.
-        goal: last pose, T_world_query; by default, if it is kept, the demonstration's, carried by the centroids.
-        fix_last: end at the goal; without, the demonstration is carried rigidly with the pick.
+        field: descriptor field of the new object.
+        reference: the demonstration.
+        key: random key of the starts and of the coarse query points.
+        goal: last pose, (7,), T_world_query; by default the demonstration's last pose, moved by the centroids.
+        fix_last: end at the goal; otherwise the demonstration is carried rigidly with the pick.
         config: settings.
-        progress, mesh: see `solve`.
+        progress: see `solve`.
+        device_mesh: see `solve`.
 
     Returns:
-        A result whose rows are the picks that the solver's finalists came to, each with its trajectory; losses and
-        energies are those of the picks' descriptors.
+        The result. Each candidate is a pick with its trajectory; its energy is that of the pick's descriptors.
 
     Raises:
         InputError: as for `solve`, or a goal that fix_last=False would not keep.
@@ -109,22 +124,26 @@ def carry(
     if goal is not None and not fix_last:
         raise InputError("carry(): there is a goal, and fix_last=False does not keep it; drop one of them")
     if fix_last:
-        goal = default_goal(field, reference) if goal is None else goal
-        check_goal("carry()", goal)
-        goal = jnp.asarray(goal)
-    picked = Reference(reference.descriptors[:1], Trajectory(reference.trajectory.wxyz_xyz[:1]), reference.query)
+        goal = jnp.asarray(checks.pose("carry()", "goal", default_goal(field, reference) if goal is None else goal))
+    pick = Reference(reference.descriptors[:1], Trajectory(reference.trajectory.wxyz_xyz[:1]), reference.query)
     result = solve(
         field,
-        picked,
+        pick,
         key,
         fix_last=False,
         energy=EnergyWeights(0.0),
         config=config.solver,
         progress=progress,
-        mesh=mesh,
+        device_mesh=device_mesh,
     )
-    trajectories, starts = (
-        carry_to_picks(reference.trajectory, part[:, 0], goal) for part in (result.trajectories, result.starts)
+    # Candidates and starts go through one program.
+    picks = jnp.concatenate([result.trajectories[:, 0], result.initial_trajectories[:, 0]])
+    trajectories = carry_to_picks(reference.trajectory, picks, goal)
+    count = len(result.trajectories)
+    residual = pick_residual(result.loss, pick.descriptors[0]) if result.finite.any() else np.nan
+    return dataclasses.replace(
+        result,
+        trajectories=trajectories[:count],
+        initial_trajectories=trajectories[count:],
+        residual=jnp.asarray(residual, result.energies.dtype),
     )
-    left = pick_residual(result.loss, picked.descriptors[0]) if result.finite.any() else float("nan")
-    return dataclasses.replace(result, trajectories=trajectories, starts=starts, residual=left)

@@ -1,78 +1,172 @@
-"""What a solver returns: the final state of every start."""
+"""The result of a solver: final candidates, and where every start began and how its energy fell."""
 
 import dataclasses
 import functools
+import html
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from tdf_jax._internal import checks
+from tdf_jax._internal.deprecation import renamed_fields
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.trajectory import Trajectory
 
 
+def _unknown() -> np.ndarray:
+    return np.full((), np.nan, np.float32)
+
+
+@renamed_fields(losses="candidate_history", starts="initial_trajectories")
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=["trajectories", "losses", "energies", "starts", "residual", "confidence", "recognised"],
+    data_fields=[
+        "trajectories",
+        "energies",
+        "candidate_history",
+        "initial_trajectories",
+        "history",
+        "residual",
+        "confidence",
+        "recognised",
+    ],
     meta_fields=[],
 )
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False, eq=False)
 class Result:
-    """What every start came to.
+    """What a solver returns, whichever it is. Every field is an array; what is unknown is NaN.
+
+    `optimize` keeps every start to the end, so its candidates are its starts. `solve` and `carry` follow many starts on
+    a few query points, drop most of them, and refine the best distinct candidates on all query points.
+
+    The properties work on traced values and on results with leading batch axes, such as those that `jax.vmap` returns.
 
     Attributes:
-        trajectories: (inits, poses, 7), `wxyz_xyz`, T_world_query.
-        losses: (inits, iterations), the energy before each step; the first column is the start's.
-        energies: (inits,), the energy of `trajectories`, after the last step.
-        starts: (inits, poses, 7), where they began.
-        residual: of `carry`: what the best pick leaves of the demonstration's descriptors, see `tdf_jax.confidence`;
-            None of others.
-        confidence: of `imitate` with `CarryConfig`: how likely the pick is right, in [0, 1], see `tdf_jax.confidence`;
-            None of others, and with weights that it is not calibrated for.
-        recognised: of `imitate` with shipped weights: how likely the object is of the demonstration's category, in [0,
-            1], see `tdf_jax.recognition`; None of others.
+        trajectories: final candidates, (candidates, poses, 7), `wxyz_xyz`, T_world_query.
+        energies: energy of each candidate after the last step, (candidates,).
+        candidate_history: energy of each candidate before each step, (candidates, steps). Before the last stage of
+            `solve` and `carry`, row k holds the energies of the k-th best candidates at that step, on the coarse query
+            points.
+        initial_trajectories: initial poses of every start, (starts, poses, 7), T_world_query.
+        history: energy of every start before each step, (starts, steps); NaN where the solver does not follow the
+            start. Of several waypoints `solve` follows the starts as trajectories in the search stage only.
+        residual: what the best pick of `carry` leaves unmatched of the demonstration's descriptors, see
+            `tdf_jax.confidence`; a scalar, NaN of other solvers.
+        confidence: probability that the pick is right, in [0, 1], see `tdf_jax.confidence`; a scalar, set by `imitate`
+            with weights that it is calibrated for.
+        recognised: probability that the object is of the demonstration's category, in [0, 1], see
+            `tdf_jax.recognition`; a scalar, set by `imitate` with shipped weights.
     """
 
-    trajectories: Float[Array, "inits poses 7"]
-    losses: Float[Array, "inits iterations"]
-    energies: Float[Array, " inits"]
-    starts: Float[Array, "inits poses 7"]
-    residual: float | None = None
-    confidence: float | None = None
-    recognised: float | None = None
+    trajectories: Float[Array, "*batch candidates poses 7"]
+    energies: Float[Array, "*batch candidates"]
+    candidate_history: Float[Array, "*batch candidates steps"]
+    initial_trajectories: Float[Array, "*batch starts poses 7"]
+    history: Float[Array, "*batch starts steps"]
+    residual: Float[Array, "*batch"] = dataclasses.field(default_factory=_unknown)
+    confidence: Float[Array, "*batch"] = dataclasses.field(default_factory=_unknown)
+    recognised: Float[Array, "*batch"] = dataclasses.field(default_factory=_unknown)
 
     @property
-    def finite(self) -> Bool[np.ndarray, " inits"]:
-        """Which starts stayed finite."""
-        return np.isfinite(self.energies) & np.isfinite(self.trajectories).all(axis=(1, 2))
+    def finite(self) -> Bool[Array | np.ndarray, "*batch candidates"]:
+        """Which candidates are finite."""
+        xp = self._numpy
+        return xp.isfinite(self.energies) & xp.isfinite(xp.asarray(self.trajectories)).all(axis=(-2, -1))
 
     @property
-    def best(self) -> int:
-        """Index of the finite start with the least energy.
+    def best(self) -> int | Int[Array | np.ndarray, "*batch"]:
+        """Index of the finite candidate with the least energy; of a batch, one for each result.
 
         Raises:
-            InputError: no start stayed finite.
+            InputError: no candidate is finite. Traced values are not checked: index 0 is taken.
         """
-        if not self.finite.any():
+        finite, xp = self.finite, self._numpy
+        if not checks.traced(finite) and not np.asarray(finite).any(axis=-1).all():
             raise InputError(
-                f"Result.best: {self.status}; check the weights and the query points, or, with Adam, lower rotation_rate and translation_rate"
+                f"Result.best: {self.status}; check the weights and the query points, or, with Adam, lower "
+                "rotation_rate and translation_rate"
             )
-        return int(np.argmin(np.where(self.finite, self.energies, np.inf)))
+        best = xp.argmin(xp.where(finite, xp.asarray(self.energies), xp.inf), axis=-1)
+        return best if checks.traced(finite) or np.ndim(best) else int(best)
 
     @property
     def trajectory(self) -> Trajectory:
-        """The best trajectory."""
-        return Trajectory(self.trajectories[self.best])
+        """The best trajectory, T_world_query."""
+        index = jnp.asarray(self.best)[..., None, None, None]
+        return Trajectory(jnp.take_along_axis(jnp.asarray(self.trajectories), index, axis=-3)[..., 0, :, :])
 
     @property
-    def loss(self) -> float:
-        """Energy of the best trajectory."""
-        return float(self.energies[self.best])
+    def loss(self) -> float | Float[Array, "*batch"]:
+        """Energy of the best trajectory; a Python float outside a trace, unless there is a batch."""
+        loss = jnp.take_along_axis(jnp.asarray(self.energies), jnp.asarray(self.best)[..., None], axis=-1)[..., 0]
+        return loss if checks.traced(loss) or loss.ndim else float(loss)
 
     @property
     def status(self) -> str:
-        """How the starts ended, in words."""
-        failed = np.flatnonzero(~self.finite)
+        """How the candidates ended, in words."""
+        finite = np.asarray(self.finite)
+        failed, kind = np.argwhere(~finite), "candidates" if self._pruned else "starts"
         if len(failed) == 0:
-            return f"all {len(self.energies)} starts finite"
-        return f"{len(failed)} of {len(self.energies)} starts became non-finite: {', '.join(map(str, failed))}"
+            return f"all {finite.size} {kind} finite"
+        names = ", ".join(str(index[0]) if len(index) == 1 else str(tuple(map(int, index))) for index in failed)
+        return f"{len(failed)} of {finite.size} {kind} became non-finite: {names}"
+
+    @property
+    def _numpy(self):
+        return jnp if checks.traced(self.energies, self.trajectories) else np
+
+    @property
+    def _pruned(self) -> bool:
+        return np.shape(self.energies)[-1] != np.shape(self.history)[-2]
+
+    def __repr__(self) -> str:
+        rows = self._summary()
+        width = max(map(len, rows))
+        return "\n".join(["Result", *(f"  {name:<{width}}  {value}" for name, value in rows.items())])
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><th style='text-align:left'>{html.escape(name)}</th><td style='text-align:left'>{html.escape(value)}</td></tr>"
+            for name, value in self._summary().items()
+        )
+        return f"<table><caption>Result</caption>{rows}</table>"
+
+    def _summary(self) -> dict[str, str]:
+        """What `repr` prints: the pick pose, energies, confidence and distinct solutions; shapes of what is traced or a batch."""
+        shapes = {"trajectories": str(np.shape(self.trajectories)), "starts": str(np.shape(self.history)[:-1])}
+        if checks.traced(self.energies, self.trajectories) or np.ndim(self.energies) != 1:
+            return shapes
+        starts, candidates = len(self.history), len(self.energies)
+        rows = {
+            "starts": f"{starts}" + (f", {candidates} candidates kept" if self._pruned else ""),
+            "poses": f"{np.shape(self.trajectories)[-2]}",
+            "status": self.status,
+        }
+        if not np.asarray(self.finite).any():
+            return rows
+        pick = np.asarray(self.trajectory.wxyz_xyz[0])
+        energies = np.sort(np.asarray(self.energies)[np.asarray(self.finite)])
+        others = ", ".join(f"{energy:.5f}" for energy in energies[1:4]) + (", ..." if len(energies) > 4 else "")
+        rows["pick"] = f"xyz {_numbers(pick[4:])} m, wxyz {_numbers(pick[:4])} (T_world_query)"
+        rows["loss"] = f"{energies[0]:.5f}" + (f" (others: {others})" if others else "")
+        for name, words in (
+            ("confidence", "that the pick is right to 2 cm and 20 degrees"),
+            ("recognised", "that the object is of the demonstration's category"),
+        ):
+            value = float(getattr(self, name))
+            rows[name] = f"{value:.2f} {words}" if np.isfinite(value) else "unknown"
+        rows["solutions"] = f"{_distinct_picks(self)} distinct picks"
+        return rows
+
+
+def _numbers(values) -> str:
+    return "(" + ", ".join(f"{value:.3f}" for value in values) + ")"
+
+
+def _distinct_picks(result: Result) -> int:
+    # Display may look at what comes after the solvers: tests/test_layout.py lists this import.
+    from tdf_jax.uncertainty.modes import cluster_poses
+
+    return len(cluster_poses(np.asarray(result.trajectories)[:, 0], np.asarray(result.energies)))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from tdf_jax._internal.deprecation import renamed_fields
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import waypoint_loss
 from tdf_jax.energy.reference import Reference
@@ -30,9 +31,9 @@ FREE = 0.03
 # Passes of the fit, and the share by which a pass may still change one sigma. The field of a mug takes three or four; a
 # random network, on which the stiffest direction is 100 times as stiff as the softest in sigma, takes the most.
 PASSES, SETTLED = 8, 0.01
-FIRST_TURN, LARGEST_TURN = np.radians(5), np.radians(15)  # of the steps, which are lengths: turns times the lever
-LARGEST_SIGMA = 1.0  # radians, times the lever: what a direction without any curvature gets
-SLIDE = 1e-3  # a unit twist with less turn times lever has its axis a thousand levers away
+FIRST_TURN, LARGEST_TURN = np.radians(5), np.radians(15)  # of the steps, which are lengths: turns times the rotation_scale
+LARGEST_SIGMA = 1.0  # radians, times the rotation_scale: what a direction without any curvature gets
+SLIDE = 1e-3  # a unit twist with less turn times rotation_scale has its axis a thousand rotation scales away
 _FIRST, _SECOND = np.tril_indices(6, -1)
 _AXES = np.eye(6)
 
@@ -59,9 +60,10 @@ class Screw:
     pitch: float
 
 
+@renamed_fields(lever="rotation_scale")
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=["curvature", "covariance", "values", "directions", "centre", "lever", "scale"],
+    data_fields=["curvature", "covariance", "values", "directions", "centre", "rotation_scale", "scale"],
     meta_fields=[],
 )
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -71,13 +73,13 @@ class PoseCovariance:
     Attributes:
         curvature: H of E(twist) = E(0) + twist' H twist / 2; energy over radians and metres.
         covariance: 2 `scale` H^-1: one sigma along any axis of the ellipsoid raises the energy by `scale`. It is
-            nowhere more than 1 radian times the lever, which is also what directions get along which the energy does
+            nowhere more than 1 radian times the rotation_scale, which is also what directions get along which the energy does
             not rise at all.
-        values: curvatures along `directions`, rising, energy / m^2: per metre of move, or of turn times the lever.
-        directions: twists in rows, of length 1 m if turns are multiplied by the lever, and at right angles to each
+        values: curvatures along `directions`, rising, energy / m^2: per metre of move, or of turn times the rotation_scale.
+        directions: twists in rows, of length 1 m if turns are multiplied by the rotation_scale, and at right angles to each
             other in that measure.
         centre: the query points' mean at the pose, metres, world frame.
-        lever: root mean square distance of the query points from their mean, metres: what a turn of one radian moves
+        rotation_scale: root mean square distance of the query points from their mean, metres: what a turn of one radian moves
             them by, in round numbers.
         scale: rise of the energy that counts as one sigma.
     """
@@ -87,7 +89,7 @@ class PoseCovariance:
     values: Float[Array, "6"]
     directions: Float[Array, "6 6"]
     centre: Float[Array, "3"]
-    lever: Float[Array, ""]
+    rotation_scale: Float[Array, ""]
     scale: Float[Array, ""]
 
     @property
@@ -101,14 +103,14 @@ class PoseCovariance:
             raise InputError(
                 f"PoseCovariance.free: there is a batch of shape {values.shape[:-1]}; expected one pose. Take one by jax.tree.map(lambda part: part[i], ...)"
             )
-        bound = max(FREE * values[-1], float(_least_value(self.scale, self.lever)))
+        bound = max(FREE * values[-1], float(_least_value(self.scale, self.rotation_scale)))
         return np.asarray(self.directions)[values <= bound]
 
     @property
     def screws(self) -> list[Screw]:
         """The free twists as motions about axes: an object of revolution's is a turn about its axis, pitch 0."""
         return [
-            _screw(twist.astype(np.float64), np.asarray(self.centre, np.float64), float(self.lever))
+            _screw(twist.astype(np.float64), np.asarray(self.centre, np.float64), float(self.rotation_scale))
             for twist in self.free
         ]
 
@@ -127,7 +129,7 @@ def pose_covariance(
     little, so the curvature is a secant: it is fitted to rises of the energy, each the mean of a step and its opposite,
     which the slope left at the pose cancels out of. The steps are along six axes and their pairs' diagonals, the axes
     those of the ellipsoid that the pass before found, as long as raises the energy by `scale`, or 15 degrees times the
-    lever if that is less.
+    rotation_scale if that is less.
 
     It says which directions are certain and which are not on one object; how much the shapes of two objects differ it
     cannot know. On 18 handles of generated mugs the root of the summed variances was 5.5 degrees and 3.4 mm in the
@@ -178,12 +180,12 @@ def _check(function, reference, pose, waypoint, scale):
 def _covariance(field, query, descriptors, pose, scale):
     R, middle = se3.rotation(pose), jnp.mean(query, axis=0)
     query = query - middle
-    lever = jnp.sqrt(jnp.mean(jnp.sum(query**2, axis=-1)))
+    rotation_scale = jnp.sqrt(jnp.mean(jnp.sum(query**2, axis=-1)))
     centre = se3.rotate(R, middle[None])[0] + se3.translation(pose)
 
     def energy(step):
         # In the query's axes the steps turn with object and pose, and so does all that follows from them.
-        turned, moved = _screwed(R, step[:3] / lever, step[3:])
+        turned, moved = _screwed(R, step[:3] / rotation_scale, step[3:])
         return waypoint_loss(turned, centre + moved, field, query, descriptors)
 
     start = energy(jnp.zeros(6, query.dtype))
@@ -191,7 +193,7 @@ def _covariance(field, query, descriptors, pose, scale):
 
     def stretched(values):
         """Lengths of steps that raise the energy by the scale, if the curvatures are right."""
-        return jnp.sqrt(2 * scale / jnp.maximum(values, 2 * scale / (LARGEST_TURN * lever) ** 2))
+        return jnp.sqrt(2 * scale / jnp.maximum(values, 2 * scale / (LARGEST_TURN * rotation_scale) ** 2))
 
     def again(found):
         count, lengths, _, values = found
@@ -212,27 +214,27 @@ def _covariance(field, query, descriptors, pose, scale):
         values, rotated = jnp.linalg.eigh(matrix)
         return count + 1, lengths, _product(axes, rotated), values
 
-    first = jnp.full(6, FIRST_TURN * lever, query.dtype), jnp.eye(6, dtype=query.dtype), jnp.zeros(6, query.dtype)
+    first = jnp.full(6, FIRST_TURN * rotation_scale, query.dtype), jnp.eye(6, dtype=query.dtype), jnp.zeros(6, query.dtype)
     _, _, axes, values = jax.lax.while_loop(again, once, (jnp.int32(0), *first))
     axes = jnp.concatenate([_product(R, axes[:3]), _product(R, axes[3:])])  # the world's axes
     # Twists of unit length in columns, and what measures a twist along them.
-    directions = jnp.concatenate([axes[:3] / lever, axes[3:]])
-    measures = jnp.concatenate([axes[:3] * lever, axes[3:]])
-    sigma_squared = 2 * scale / jnp.maximum(values, _least_value(scale, lever))
+    directions = jnp.concatenate([axes[:3] / rotation_scale, axes[3:]])
+    measures = jnp.concatenate([axes[:3] * rotation_scale, axes[3:]])
+    sigma_squared = 2 * scale / jnp.maximum(values, _least_value(scale, rotation_scale))
     return PoseCovariance(
         curvature=_product(measures * values, measures.T),
         covariance=_product(directions * sigma_squared, directions.T),
         values=values,
         directions=directions.T,
         centre=centre,
-        lever=lever,
+        rotation_scale=rotation_scale,
         scale=scale,
     )
 
 
-def _least_value(scale, lever):
+def _least_value(scale, rotation_scale):
     """The curvature at which one sigma is as large as it may be."""
-    return 2 * scale / (LARGEST_SIGMA * lever) ** 2
+    return 2 * scale / (LARGEST_SIGMA * rotation_scale) ** 2
 
 
 def _screwed(R, turn, move):
@@ -250,9 +252,9 @@ def _product(a, b):
     return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
 
 
-def _screw(twist, centre, lever):
+def _screw(twist, centre, rotation_scale):
     turn, move = twist[:3], twist[3:]
     squared = turn @ turn
-    if lever**2 * squared < SLIDE**2:
+    if rotation_scale**2 * squared < SLIDE**2:
         return Screw(move / np.linalg.norm(move), centre, np.inf)
     return Screw(turn / np.sqrt(squared), centre + np.cross(turn, move) / squared, float(turn @ move / squared))

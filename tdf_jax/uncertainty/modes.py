@@ -36,8 +36,8 @@ class Mode:
 
 
 def cluster_poses(
-    wxyz_xyz: Float[Array, "inits 7"],
-    energies: Float[Array, " inits"],
+    wxyz_xyz: Float[Array, "candidates 7"],
+    energies: Float[Array, " candidates"],
     *,
     angle: float = SAME_ANGLE,
     distance: float = SAME_DISTANCE,
@@ -71,7 +71,7 @@ def cluster_poses(
     wxyz_xyz, energies = np.asarray(wxyz_xyz), np.asarray(energies)
     if wxyz_xyz.ndim != 2 or wxyz_xyz.shape[1] != 7 or energies.shape != wxyz_xyz.shape[:1]:
         raise InputError(
-            f"cluster_poses(): poses have shape {wxyz_xyz.shape} and energies {energies.shape}; expected (inits, 7) and (inits,). "
+            f"cluster_poses(): poses have shape {wxyz_xyz.shape} and energies {energies.shape}; expected (candidates, 7) and (candidates,). "
             "Take one waypoint of each start, such as result.trajectories[:, 0]"
         )
     for name, bound in (("angle", angle), ("distance", distance)):

@@ -78,8 +78,8 @@ def test_rotations_are_multiplied_exactly_whatever_is_set():
 
 
 @pytest.mark.parametrize(("optimise", "config", "module", "program"), [
-    (tdf.solve, tdf.SolveConfig(inits=2), gauss_newton, "descend"),
-    (tdf.optimize, tdf.OptimizeConfig(inits=2, iterations=2), sys.modules["tdf_jax.solvers.adam"], "_run"),
+    (tdf.solve, tdf.SolveConfig(num_trajectory_starts=2), gauss_newton, "descend"),
+    (tdf.optimize, tdf.OptimizeConfig(num_starts=2, iterations=2), sys.modules["tdf_jax.solvers.adam"], "_run"),
 ])  # fmt: skip
 def test_both_optimisers_are_exact(problem, monkeypatch, optimise, config, module, program):
     found, run = [], getattr(module, program)

@@ -14,7 +14,7 @@ from tdf_jax.cli.main import main
 from tdf_jax.io.demonstrations import save_demonstration
 from tdf_jax.landscape import shared_lattice
 
-QUICK = ("--points", 60, "--poses", 3, "--queries", 8, "--half", 0.1, "--pitch", 0.05)
+QUICK = ("--points", 60, "--num-poses", 3, "--queries", 8, "--half", 0.1, "--pitch", 0.05)
 
 
 def run(*words):

@@ -141,7 +141,7 @@ def test_the_mean_absolute_norm_is_over_the_twelve_numbers_of_a_pose():
     reference = coordinates_reference([(0, 0, 0)], (IDENTITY, (0, 0, 0)), (IDENTITY, (0, 1, 0)))
     # Pose 0: off by (3, -4, 0). Pose 1: a quarter turn, four entries of 1.
     found = trajectory((IDENTITY, (4, -2, 3)), (QUARTER_TURN_Z, (1, 3, 3)))
-    loss = tdf.correlation_loss(found, Coordinates.origin, reference, lever=0.5, pose_norm="mean_absolute")
+    loss = tdf.correlation_loss(found, Coordinates.origin, reference, rotation_scale=0.5, pose_norm="mean_absolute")
     np.testing.assert_allclose(loss, (7 / 12 + 2 / 12) / 2, rtol=1e-6)
 
 
@@ -200,7 +200,7 @@ def energy():
 
 @pytest.mark.parametrize("pose_norm", POSE_NORMS)
 def test_the_energy_is_the_weighted_sum_of_its_terms(energy, current, field, reference, pose_norm):
-    weights = tdf.EnergyWeights(correlation=0.7, compensator=0.3, lever=0.2, pose_norm=pose_norm)
+    weights = tdf.EnergyWeights(correlation=0.7, compensator=0.3, rotation_scale=0.2, pose_norm=pose_norm)
     correlation = tdf.correlation_loss(current, field.origin, reference, 0.2, pose_norm)
     expected = tdf.descriptor_loss(current, field, reference) + 0.7 * correlation + 0.3 * tdf.compensator_loss(current)
     np.testing.assert_allclose(energy(current, field, reference, weights), expected, rtol=1e-5)
@@ -213,7 +213,7 @@ def test_the_paper_weighs_the_correlation_by_002_and_rejects_the_compensator():
 def test_weights_are_traced(energy, current, field, reference):
     energy(current, field, reference, tdf.EnergyWeights())
     with compilations() as compiled:
-        energy(current, field, reference, tdf.EnergyWeights(correlation=0.5, compensator=0.1, lever=1.0))
+        energy(current, field, reference, tdf.EnergyWeights(correlation=0.5, compensator=0.1, rotation_scale=1.0))
     assert compiled == []
     slope = jax.jit(jax.grad(tdf.trajectory_energy, argnums=3))(current, field, reference, tdf.EnergyWeights())
     correlation = tdf.correlation_loss(current, field.origin, reference, tdf.EnergyWeights().lever)

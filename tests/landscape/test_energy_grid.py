@@ -187,7 +187,7 @@ def test_what_does_not_fit_is_refused(field, reference):
         with pytest.raises(InputError, match="no rotations"):
             energy_landscape(field, reference, grid, matrix)
     with pytest.raises(InputError, match=r"energy_landscape\(\): device_mesh is .*expected a jax.sharding.Mesh"):
-        energy_landscape(field, reference, grid, mesh=jax.devices())
+        energy_landscape(field, reference, grid, device_mesh=jax.devices())
     with pytest.raises(InputError, match="over_rotations is 'all'"):
         energy_landscape(field, reference, grid, over_rotations="all")
     with pytest.raises(InputError, match="reduce is 'min'"):

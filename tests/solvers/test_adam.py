@@ -19,8 +19,8 @@ from tdf_jax.networks.occupancy import condition, parameter_shapes
 from tdf_jax.solvers.adam import _begin, _run
 from tdf_jax.solvers.initial import default_goal, random_starts
 
-CONFIG = tdf.OptimizeConfig(inits=3, iterations=5)
-WEIGHTS = tdf.EnergyWeights(correlation=0.3, compensator=0.1, lever=0.2)
+CONFIG = tdf.OptimizeConfig(num_starts=3, iterations=5)
+WEIGHTS = tdf.EnergyWeights(correlation=0.3, compensator=0.1, rotation_scale=0.2)
 KEY = jax.random.key(0)
 SLOW = pytest.mark.slow
 
@@ -77,9 +77,9 @@ def test_the_chunked_gradient_is_that_of_the_energy(field, reference, energies, 
 @pytest.mark.slow
 def test_the_result_does_not_depend_on_the_chunk(field, reference):
     one_step = dataclasses.replace(CONFIG, iterations=1)
-    whole, parts = (run(field, reference, config=dataclasses.replace(one_step, chunk=chunk)) for chunk in (64, 2))
+    whole, parts = (run(field, reference, config=dataclasses.replace(one_step, chunk_poses=chunk)) for chunk in (64, 2))
     np.testing.assert_allclose(parts.trajectories, whole.trajectories, rtol=1e-6, atol=1e-7)
-    np.testing.assert_allclose(parts.losses, whole.losses, rtol=1e-6)
+    np.testing.assert_allclose(parts.candidate_history, whole.candidate_history, rtol=1e-6)
 
 
 def test_the_first_step_has_the_rates_of_the_settings(field, reference):
@@ -87,9 +87,9 @@ def test_the_first_step_has_the_rates_of_the_settings(field, reference):
     config = dataclasses.replace(CONFIG, iterations=1, rotation_rate=0.02, translation_rate=0.003)
     result = run(field, reference, config=config)
     centre = jnp.mean(reference.query, axis=0)[None]
-    moved = se3.transform(result.trajectories, centre) - se3.transform(result.starts, centre)
+    moved = se3.transform(result.trajectories, centre) - se3.transform(result.initial_trajectories, centre)
     np.testing.assert_allclose(np.abs(moved[:, :-1]), 0.003, rtol=0.01)
-    turned = se3.rotation_distance(se3.rotation(result.trajectories), se3.rotation(result.starts))
+    turned = se3.rotation_distance(se3.rotation(result.trajectories), se3.rotation(result.initial_trajectories))
     np.testing.assert_allclose(turned[:, :-1], 0.02 * np.sqrt(3), rtol=0.01)
 
 
@@ -98,10 +98,10 @@ def test_rates_fall_as_a_cosine(field, reference):
     config = dataclasses.replace(CONFIG, iterations=25, translation_rate=0.004, final_rate=0.1)
     away = random_poses(0, 4) * [1, 1, 1, 1, 0, 0, 0] + [0, 0, 0, 0, 9, 9, 9]
     far = jnp.asarray(np.tile(away, (3, 1, 1)), jnp.float32)
-    result = run(field, reference, config=config, energy=tdf.EnergyWeights(1e3, lever=0.0), starts=far)
+    result = run(field, reference, config=config, energy=tdf.EnergyWeights(1e3, rotation_scale=0.0), starts=far)
     decay = 0.1 + 0.9 * (1 + np.cos(np.pi * np.arange(25) / 25)) / 2
     centre = jnp.mean(reference.query, axis=0)[None]
-    moved = se3.transform(result.trajectories, centre) - se3.transform(result.starts, centre)
+    moved = se3.transform(result.trajectories, centre) - se3.transform(result.initial_trajectories, centre)
     np.testing.assert_allclose(moved[:, :-1], -0.004 * decay.sum(), rtol=0.02)
 
 
@@ -109,10 +109,10 @@ def test_rates_fall_as_a_cosine(field, reference):
 
 
 def test_losses_begin_at_the_starts_and_energies_are_of_the_result(result, energies):
-    assert result.losses.shape == (3, 5)
-    np.testing.assert_allclose(result.losses[:, 0], energies(result.starts)[0], rtol=1e-5)
+    assert result.candidate_history.shape == (3, 5)
+    np.testing.assert_allclose(result.candidate_history[:, 0], energies(result.initial_trajectories)[0], rtol=1e-5)
     np.testing.assert_allclose(result.energies, energies(result.trajectories)[0], rtol=1e-5)
-    assert (result.energies < result.losses[:, 0]).all()
+    assert (result.energies < result.candidate_history[:, 0]).all()
 
 
 def test_the_best_is_the_least_energy(result):
@@ -134,14 +134,14 @@ def test_iterations_run_in_blocks_of_one_program(field, reference, result):
         )
     assert "jit(_run)" not in compiled
     assert [done for done, _ in calls] == [20, 40, 45]
-    assert long.losses.shape == (3, 45)
+    assert long.candidate_history.shape == (3, 45)
     for done, energies in calls:
-        np.testing.assert_array_equal(energies, long.losses[:, done - 1])
-    np.testing.assert_array_equal(long.losses[:, 0], result.losses[:, 0])
-    assert (long.losses > 0).all()
-    jumps = np.abs(np.diff(long.losses, axis=1))
+        np.testing.assert_array_equal(energies, long.candidate_history[:, done - 1])
+    np.testing.assert_array_equal(long.candidate_history[:, 0], result.candidate_history[:, 0])
+    assert (long.candidate_history > 0).all()
+    jumps = np.abs(np.diff(long.candidate_history, axis=1))
     assert jumps[:, [19, 39]].max() <= jumps.max(axis=1).max()
-    assert (long.energies < long.losses[:, 0]).all()
+    assert (long.energies < long.candidate_history[:, 0]).all()
 
 
 def test_progress_can_cancel(field, reference):
@@ -157,7 +157,7 @@ def test_results_are_a_function_of_the_key(field, reference, result):
     again, other = run(field, reference), run(field, reference, key=jax.random.key(1))
     for name in ("trajectories", "losses", "energies", "starts"):
         np.testing.assert_array_equal(getattr(again, name), getattr(result, name))
-    assert np.abs(other.starts - result.starts)[:, :-1].max() > 0.01
+    assert np.abs(other.initial_trajectories - result.initial_trajectories)[:, :-1].max() > 0.01
 
 
 @pytest.mark.parametrize("start", ["carried", "scattered"])
@@ -193,40 +193,40 @@ def test_the_last_pose_is_fixed_at_the_goal_exactly(field, reference, result):
     goal = jnp.asarray(random_poses(9, 1)[0], jnp.float32)
     other = run(field, reference, goal=goal)
     np.testing.assert_array_equal(other.trajectories[:, -1], np.tile(goal, (3, 1)))
-    np.testing.assert_array_equal(other.starts[:, :-1], result.starts[:, :-1])
+    np.testing.assert_array_equal(other.initial_trajectories[:, :-1], result.initial_trajectories[:, :-1])
 
 
 def test_a_free_last_pose_starts_at_the_goal_given_or_at_random_and_moves(field, reference):
     goal = default_goal(field, reference)
     sent = run(field, reference, goal=goal, fix_last=False)
-    np.testing.assert_array_equal(sent.starts[:, -1], np.tile(goal, (3, 1)))
+    np.testing.assert_array_equal(sent.initial_trajectories[:, -1], np.tile(goal, (3, 1)))
     free = run(field, reference, fix_last=False)
-    np.testing.assert_array_equal(free.starts, random_starts(KEY, field, reference, 3, "carried", 0.1))
+    np.testing.assert_array_equal(free.initial_trajectories, random_starts(KEY, field, reference, 3, "carried", 0.1))
     for result in (sent, free):
-        assert np.abs(result.trajectories[:, -1] - result.starts[:, -1]).max(axis=-1).min() > 1e-3
+        assert np.abs(result.trajectories[:, -1] - result.initial_trajectories[:, -1]).max(axis=-1).min() > 1e-3
 
 
 def test_given_starts_are_used_and_may_end_apart(field, reference, energies):
     starts = jnp.asarray(np.stack([random_poses(seed, 4) for seed in range(3)]), jnp.float32)
     kept = run(field, reference, starts=starts)
-    np.testing.assert_array_equal(kept.starts, starts)
+    np.testing.assert_array_equal(kept.initial_trajectories, starts)
     np.testing.assert_array_equal(kept.trajectories[:, -1], starts[:, -1])
-    np.testing.assert_allclose(kept.losses[:, 0], energies(starts)[0], rtol=1e-5)
+    np.testing.assert_allclose(kept.candidate_history[:, 0], energies(starts)[0], rtol=1e-5)
     np.testing.assert_allclose(kept.energies, energies(kept.trajectories)[0], rtol=1e-5)
     goal = jnp.asarray(random_poses(9, 1)[0], jnp.float32)
     sent = run(field, reference, starts=starts, goal=goal)
-    np.testing.assert_array_equal(sent.starts, starts.at[:, -1].set(goal))
+    np.testing.assert_array_equal(sent.initial_trajectories, starts.at[:, -1].set(goal))
 
 
 def test_a_start_that_becomes_non_finite_is_reported_and_the_others_are_unaffected(field, reference, result):
     with jax.debug_nans(False):
-        far = run(field, reference, starts=result.starts.at[1, 0, 4].set(1e30))  # its square is infinite
+        far = run(field, reference, starts=result.initial_trajectories.at[1, 0, 4].set(1e30))  # its square is infinite
         assert far.finite.tolist() == [True, False, True]
         assert far.status == "1 of 3 starts became non-finite: 1"
         assert far.best in (0, 2) and np.isfinite(far.loss)
         np.testing.assert_array_equal(far.trajectories[::2], result.trajectories[::2])
-        np.testing.assert_array_equal(far.losses[::2], result.losses[::2])
-        lost = run(field, reference, starts=result.starts.at[:, 0, 4].set(1e30))
+        np.testing.assert_array_equal(far.candidate_history[::2], result.candidate_history[::2])
+        lost = run(field, reference, starts=result.initial_trajectories.at[:, 0, 4].set(1e30))
         with pytest.raises(
             InputError,
             match="3 of 3 starts became non-finite: 0, 1, 2; check the weights and the query points, or, with Adam, lower rotation_rate and translation_rate",
@@ -238,9 +238,9 @@ def test_mixed_precisions_promote(field, reference, result):
     """A float32 trajectory from a file, with the float64 query points that jax draws where it may."""
     with jax.enable_x64(True):
         mixed = dataclasses.replace(reference, query=jnp.asarray(reference.query, jnp.float64))
-        double = run(field, mixed, starts=result.starts)
+        double = run(field, mixed, starts=result.initial_trajectories)
         assert {x.dtype for x in jax.tree.leaves(double)} == {jnp.dtype("float64")}
-        np.testing.assert_allclose(double.losses[:, 0], result.losses[:, 0], rtol=1e-4)
+        np.testing.assert_allclose(double.candidate_history[:, 0], result.candidate_history[:, 0], rtol=1e-4)
 
 
 # ---- finding a pose ----
@@ -275,7 +275,7 @@ def test_a_known_pose_is_found_on_the_same_object(golden, quick_compilation):
     turns = Rotation.from_quat(picks[:, :4], scalar_first=True) * R_truth.inv()
     assert np.degrees(turns.magnitude()).max() < 1
     assert np.linalg.norm(picks[:, 4:] - truth[0, 4:], axis=1).max() < 1e-3
-    assert result.energies.max() < 0.05 * result.losses[:, 0].min()
+    assert result.energies.max() < 0.05 * result.candidate_history[:, 0].min()
 
 
 # ---- compiling and memory ----
@@ -294,7 +294,11 @@ def test_what_is_traced_does_not_compile_again(small_model, demonstration, field
         )
         run(other, tdf.describe(small_model, elsewhere), key=jax.random.key(5), goal=goal)
         for weight in (0, 0.5, np.float32(0.1), jnp.array(0.1)):
-            run(field, reference, energy=tdf.EnergyWeights(correlation=weight, compensator=weight, lever=weight))
+            run(
+                field,
+                reference,
+                energy=tdf.EnergyWeights(correlation=weight, compensator=weight, rotation_scale=weight),
+            )
         run(field, reference, config=dataclasses.replace(CONFIG, **rates))
         run(field, reference, config=dataclasses.replace(CONFIG, iterations=7))
     programs = {"_run", "_begin", "_trajectories", "_random_starts", "_encode", "trajectory_descriptor"}
@@ -363,14 +367,18 @@ def test_bad_goals_are_refused(field, reference, goal):
 
 
 def test_bad_starts_are_refused(field, reference, result):
-    for starts in (result.starts[0], result.starts[:, :3], result.starts[..., :6]):
+    for starts in (
+        result.initial_trajectories[0],
+        result.initial_trajectories[:, :3],
+        result.initial_trajectories[..., :6],
+    ):
         with pytest.raises(InputError, match=r"optimize\(\): starts have shape .* expected \(inits, 4, 7\)"):
             run(field, reference, starts=starts)
     with jax.debug_nans(False):
         with pytest.raises(InputError, match="NaN or infinite"):
-            run(field, reference, starts=result.starts.at[0, 1, 5].set(np.nan))
+            run(field, reference, starts=result.initial_trajectories.at[0, 1, 5].set(np.nan))
     with pytest.raises(InputError, match="quaternion"):
-        run(field, reference, starts=result.starts.at[2, 1, :4].set(0.0))
+        run(field, reference, starts=result.initial_trajectories.at[2, 1, :4].set(0.0))
 
 
 def test_a_reference_of_another_network_is_refused(field, reference):

@@ -27,15 +27,15 @@ path = tdf.wave(4, start=(0, 0, 0), end=(0, 0.2, 0))
 reference = tdf.describe(model, tdf.Demonstration(cloud, path, tdf.box_query(jax.random.key(1), 20, 0.06)))
 field = tdf.encode(model, cloud + 0.01)
 calls = []
-for config, rows in ((tdf.OptimizeConfig(inits=11, iterations=5), 11), (tdf.SolveConfig(inits=3, scouts=13, points=8, steps=(3, 3, 3, 2, 2, 3)), 2)):
+for config, rows in ((tdf.OptimizeConfig(num_starts=11, iterations=5), 11), (tdf.SolveConfig(num_starts=13, num_trajectory_starts=3, num_coarse_queries=8, coarse_steps=3, prune_steps=3, search_steps=3, propagate_steps=2, refine_steps=2, polish_steps=3), 2)):
     minimise = tdf.optimize if isinstance(config, tdf.OptimizeConfig) else tdf.solve
     one = minimise(field, reference, jax.random.key(2), config=config)
     mesh = jax.make_mesh((4, 2), ('hosts', 'starts')) if several else jax.make_mesh((8,), ('starts',))
     many = minimise(
-        field, reference, jax.random.key(2), config=config, mesh=mesh, progress=lambda done, energies: calls.append(energies.shape)
+        field, reference, jax.random.key(2), config=config, device_mesh=mesh, progress=lambda done, energies: calls.append(energies.shape)
     )
     assert many.trajectories.shape == (rows, 4, 7)
-    for name in ('trajectories', 'losses', 'energies', 'starts'):
+    for name in ('trajectories', 'energies', 'candidate_history', 'initial_trajectories', 'history'):
         np.testing.assert_allclose(getattr(many, name), getattr(one, name), rtol=1e-5, atol=1e-5, err_msg=f'{minimise.__name__} {name}')
 assert calls == [(11,)] + [(2,)] * 6
 
@@ -49,7 +49,7 @@ grid = tdf.plane_grid(0.2, 21)
 one = tdf.energy_landscape(field, shown, grid)
 shared_lattice._tile = noted
 tiles = []
-many = tdf.energy_landscape(field, shown, grid, mesh=mesh, progress=lambda done, total: tiles.append(total))
+many = tdf.energy_landscape(field, shown, grid, device_mesh=mesh, progress=lambda done, total: tiles.append(total))
 np.testing.assert_allclose(many.values, one.values, rtol=1e-5)
 assert used == set(jax.local_devices()), used
 assert len(tiles) == tiles[0] and tiles[0] % 8, tiles  # the last round leaves some devices without a tile

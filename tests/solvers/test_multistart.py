@@ -20,9 +20,21 @@ from tdf_jax.solvers.multistart import Candidates, SolveConfig
 
 solve = sys.modules["tdf_jax.solvers.multistart"]  # `tdf_jax.solve` is the function
 
-CONFIG = SolveConfig(inits=3, scouts=8, points=3, steps=(2, 1, 3, 2, 2, 3), tolerance=0.0)
-LONG = (2, 1, 3, 2, 2, 30)
-WEIGHTS = tdf.EnergyWeights(correlation=0.3, lever=0.2)
+CONFIG = SolveConfig(
+    num_trajectory_starts=3,
+    num_starts=8,
+    num_coarse_queries=3,
+    coarse_steps=2,
+    prune_steps=1,
+    search_steps=3,
+    propagate_steps=2,
+    refine_steps=2,
+    polish_steps=3,
+    tolerance=0.0,
+)
+STEPS = tuple(f"{stage}_steps" for stage in ("coarse", "prune", "search", "propagate", "refine", "polish"))
+LONG = dict(zip(STEPS, (2, 1, 3, 2, 2, 30)))
+WEIGHTS = tdf.EnergyWeights(correlation=0.3, rotation_scale=0.2)
 KEY = jax.random.key(0)
 SLOW = pytest.mark.slow
 
@@ -60,7 +72,7 @@ def test_energies_and_gradients_are_those_of_the_energy(field, reference, pose_n
     assert problem.query.shape == (3, 3, 3) and problem.weights.sum() == 8
     starts = random_starts(KEY, field, reference, 5, "scattered", 0.1)
     drawn = solve._candidates(starts, problem)
-    R, place = drawn.R.reshape(-1, 3, 3), drawn.place.reshape(-1, 3)
+    R, place = drawn.R.reshape(-1, 3, 3), drawn.centroid.reshape(-1, 3)
     waypoint = np.tile(np.arange(4), 5)
     values = gauss_newton._evaluate(R, place, waypoint, np.array([20, 20, 3, 0]), field, problem, weights, 128)
 
@@ -124,7 +136,7 @@ def test_chunks_do_not_show(field, reference):
     drawn = solve._candidates(random_starts(KEY, field, reference, 2, "carried", 0.1), problem)
     settings = (
         drawn.R.reshape(-1, 3, 3),
-        drawn.place.reshape(-1, 3),
+        drawn.centroid.reshape(-1, 3),
         np.tile(np.arange(4), 2),
         np.array([8, 8, 3, 0]),
         field,
@@ -146,10 +158,10 @@ def test_carried_candidates_are_rigid_motions_of_the_demonstration(field, refere
     starts = random_starts(KEY, field, reference, 4, "scattered", 0.1)
     drawn = solve._candidates(starts, problem)
     energy = np.random.default_rng(0).uniform(size=(4, 3))
-    found = Candidates(drawn.R[:, :3], drawn.place[:, :3], energy)
-    picked = Candidates(drawn.R[2:, 1:2], drawn.place[2:, 1:2])
+    found = Candidates(drawn.R[:, :3], drawn.centroid[:, :3], energy)
+    picked = Candidates(drawn.R[2:, 1:2], drawn.centroid[2:, 1:2])
     shown_candidates = solve._candidates(reference.trajectory.wxyz_xyz, problem)
-    new = np.array(solve._poses(solve._carried(found, picked, 1, shown_candidates, field.origin), problem), np.float64)
+    new = np.array(solve._poses(solve._propagated(found, picked, 1, shown_candidates, field.origin), problem), np.float64)
     assert new.shape == (6, 3, 7)
     shown = np.array(reference.trajectory.shifted(field.origin).wxyz_xyz[:3], np.float64)
     for index, (row, waypoint) in enumerate(
@@ -173,12 +185,13 @@ def test_distinct_candidates_are_the_best_of_each_waypoint():
     place = np.zeros((4, 2, 3))
     place[3, :, 0] = 0.05
     energy = np.array([[0.2, 0.4], [0.1, 0.3], [0.4, 0.2], [0.3, 0.1]])
-    best = solve._distinct(Candidates(R, place, energy), 3)
+    best, rows = solve._distinct(Candidates(R, place, energy), 3)
     # Candidates 0 and 1 are 3 degrees apart and count as one.
     for waypoint, expected in enumerate([[1, 3, 2], [3, 2, 1]]):
         np.testing.assert_array_equal(best.R[:, waypoint], turns[expected])
-        np.testing.assert_array_equal(best.place[:, waypoint], place[expected, waypoint])
-    most = solve._distinct(Candidates(R, place, energy), 4)
+        np.testing.assert_array_equal(best.centroid[:, waypoint], place[expected, waypoint])
+        np.testing.assert_array_equal(rows[:, waypoint], expected)
+    most, _ = solve._distinct(Candidates(R, place, energy), 4)
     np.testing.assert_array_equal(most.R[3, 0], turns[0])  # none distinct is left
 
 
@@ -186,14 +199,13 @@ def test_distinct_candidates_are_the_best_of_each_waypoint():
 
 
 def test_energies_are_those_of_the_trajectories_and_the_first_is_the_best(result, field, reference):
-    assert result.trajectories.shape == (2, 4, 7) and result.losses.shape == (2, 10)
+    assert result.trajectories.shape == (2, 4, 7) and result.candidate_history.shape == (2, 10)
     np.testing.assert_allclose(result.energies, energy_of(result.trajectories, field, reference), rtol=1e-5)
-    np.testing.assert_allclose(result.losses[:, -3], energy_of(result.starts, field, reference), rtol=1e-5)
     assert result.best == 0 and result.energies[0] <= result.energies[1]
     # energies of one set of query points do not rise
     for stage in (slice(0, 3), slice(3, 5), slice(5, 7), slice(7, 10)):
-        assert (np.diff(result.losses[:, stage], axis=1) <= 1e-7).all()
-    assert (result.energies <= result.losses[:, -1] + 1e-7).all()
+        assert (np.diff(result.candidate_history[:, stage], axis=1) <= 1e-7).all()
+    assert (result.energies <= result.candidate_history[:, -1] + 1e-7).all()
 
 
 def test_the_last_pose_is_fixed_at_the_goal_exactly(field, reference, result):
@@ -205,7 +217,7 @@ def test_the_last_pose_is_fixed_at_the_goal_exactly(field, reference, result):
 def test_a_free_last_pose_moves_and_energies_are_of_all_poses(field, reference):
     weights = tdf.EnergyWeights(0.0)  # at the goal, eq. 3 alone is least
     free, fixed = (
-        run(field, reference, config=SolveConfig(points=8), energy=weights, fix_last=fix_last)
+        run(field, reference, config=SolveConfig(num_coarse_queries=8), energy=weights, fix_last=fix_last)
         for fix_last in (False, True)
     )
     np.testing.assert_allclose(free.energies, energy_of(free.trajectories, field, reference, weights), rtol=1e-5)
@@ -232,7 +244,7 @@ def test_it_reaches_what_adam_reaches(field, reference):
             reference,
             starts=starts,
             goal=default_goal(field, reference),
-            config=SolveConfig(points=8, steps=(30,) * 6, tolerance=0.0),
+            config=SolveConfig(num_coarse_queries=8, **dict.fromkeys(STEPS, 30), tolerance=0.0),
         )
         assert found.loss < 1.02 * adam.loss
 
@@ -263,17 +275,16 @@ def test_a_known_pose_is_found_on_the_same_object(golden, quick_compilation):
 
 def test_results_are_a_function_of_the_key(field, reference, result):
     again, other = run(field, reference), run(field, reference, key=jax.random.key(1))
-    for name in ("trajectories", "losses", "energies", "starts"):
+    for name in ("trajectories", "energies", "candidate_history", "initial_trajectories", "history"):
         np.testing.assert_array_equal(getattr(again, name), getattr(result, name))
     assert np.abs(other.trajectories - result.trajectories)[:, :-1].max() > 1e-3
 
 
 def test_a_stage_ends_when_no_step_promises_enough(field, reference):
-    result = run(field, reference, config=dataclasses.replace(CONFIG, steps=LONG, tolerance=0.5))
-    np.testing.assert_array_equal(result.losses[:, -29:], np.tile(result.losses[:, -1:], 29))
-    thorough = run(field, reference, config=dataclasses.replace(CONFIG, steps=LONG))
+    result = run(field, reference, config=dataclasses.replace(CONFIG, **LONG, tolerance=0.5))
+    np.testing.assert_array_equal(result.candidate_history[:, -29:], np.tile(result.candidate_history[:, -1:], 29))
+    thorough = run(field, reference, config=dataclasses.replace(CONFIG, **LONG))
     assert thorough.loss < result.loss
-    np.testing.assert_array_equal(result.trajectories, result.starts)
 
 
 def test_a_start_that_is_not_finite_does_not_spoil_the_others(field, reference):
@@ -299,7 +310,12 @@ def test_stages_and_what_is_traced_share_one_program(small_model, field, referen
     with compilations() as compiled:
         other = tdf.encode(small_model, jnp.asarray(random_cloud(30), jnp.float32))
         for weight in (0, 0.5, jnp.array(0.1)):
-            run(other, reference, key=jax.random.key(5), energy=tdf.EnergyWeights(correlation=weight, lever=weight))
+            run(
+                other,
+                reference,
+                key=jax.random.key(5),
+                energy=tdf.EnergyWeights(correlation=weight, rotation_scale=weight),
+            )
         run(field, reference, config=dataclasses.replace(CONFIG, tolerance=0.1))
     assert not {"jit(descend)", "jit(in_blocks)", "jit(_random_starts)"} & set(compiled)
 

@@ -14,7 +14,9 @@ import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 
 KEY = jax.random.key(0)
-CONFIG = tdf.CarryConfig(scouts=8, points=3, steps=(2, 2, 3, 6), finalists=3)
+CONFIG = tdf.CarryConfig(
+    num_starts=8, num_coarse_queries=3, coarse_steps=2, prune_steps=2, refine_steps=3, polish_steps=6, num_candidates=3
+)
 
 
 def motion_of(new, old):
@@ -125,7 +127,7 @@ def test_picks_are_those_of_descriptors_alone(result, picked, field):
     np.testing.assert_array_equal(result.energies, solved.energies)
     energies = [tdf.descriptor_loss(tdf.Trajectory(one), field, alone) for one in solved.trajectories]
     np.testing.assert_allclose(result.energies, energies, rtol=1e-5)
-    assert result.energies[0] < result.losses[:, 0].max()
+    assert result.energies[0] < result.candidate_history[:, 0].max()
 
 
 def test_rows_are_carried_from_their_picks_to_the_goal(result, reference, field):

@@ -9,9 +9,7 @@ import pytest
 from conftest import random_cloud
 
 import tdf_jax as tdf
-from tdf_jax.evaluation.cases import generated_case
-from tdf_jax.evaluation.pick_transfer import QUERY_SIZE
-from tdf_jax.evaluation.scene import place_demonstration
+from tdf_jax.evaluation.cases import QUERY_SIZE, generated_case, place_demonstration
 from tdf_jax.uncertainty.calibration import logistic
 
 KEY = jax.random.key(0)
@@ -68,7 +66,15 @@ def test_a_fit_finds_the_curve_that_the_cases_were_drawn_from():
 def test_shipped_weights_judge_the_object_and_others_do_not(small_model, monkeypatch):
     cloud, other = (random_cloud(seed).astype(np.float32) for seed in (3, 4))
     demonstration = tdf.Demonstration(cloud, tdf.line(num_poses=2), tdf.box_query(KEY, 8))
-    config = tdf.CarryConfig(scouts=2, finalists=1, points=4, steps=(1, 1, 1, 1))
+    config = tdf.CarryConfig(
+        num_starts=2,
+        num_candidates=1,
+        num_coarse_queries=4,
+        coarse_steps=1,
+        prune_steps=1,
+        refine_steps=1,
+        polish_steps=1,
+    )
 
     def found(name, curve):
         monkeypatch.setattr("tdf_jax.imitation.CURVES", {"mug": curve})

@@ -372,7 +372,7 @@ def transferred(model, query, points_a, points_b, place):
     )
     reference = tdf.Reference(tdf.trajectory_descriptor(field, shown, query), shown.shifted(-field.origin), query)
     moved = tdf.encode(model, carried(T_WORLD_OBJECT, points_b).astype(np.float32))
-    config = tdf.SolveConfig(scouts=32, finalists=2)
+    config = tdf.SolveConfig(num_starts=32, num_candidates=2)
     result = tdf.solve(
         moved, reference, jax.random.key(1), fix_last=False, energy=tdf.EnergyWeights(0.0), config=config
     )
