@@ -32,8 +32,9 @@ jax.config.update("jax_debug_nans", True)
 
 def pytest_runtest_setup(item):
     """LLVM's optimisation is half of a compilation and changes rounding only; parity, and what runs long, keep it."""
-    names = item.fixturenames
-    quick = "quick_compilation" in names or ("small_model" in names and "golden" not in names)
+    long = item.get_closest_marker("slow") and "small_model" not in item.fixturenames
+    parity = "golden" in item.fixturenames
+    quick = "quick_compilation" in item.fixturenames or not (long or parity)
     jax.config.update("jax_disable_most_optimizations", quick)
 
 
