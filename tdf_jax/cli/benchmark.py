@@ -1,4 +1,4 @@
-"""`tdf benchmark`: imitations of whole trajectories with ground truth, by the library, the paper's energy and baselines."""
+"""`tdf benchmark`: imitations of whole trajectories by the library, the paper's energy and baselines."""
 
 import functools
 from collections.abc import Callable
@@ -142,8 +142,8 @@ def _folder(out: Path) -> Path:
 
     if (out / PAGE).exists() and not (out / RECORD).exists():
         raise InputError(
-            f"tdf benchmark: {out / PAGE} is not of an earlier benchmark, there is no {RECORD} beside it; expected another "
-            "--out: nothing of yours is overwritten"
+            f"tdf benchmark: {out / PAGE} is not of an earlier benchmark, there is no {RECORD} beside it; expected "
+            "another --out: nothing of yours is overwritten"
         )
     try:
         (out / RUNS).mkdir(parents=True, exist_ok=True)

@@ -96,8 +96,8 @@ def evaluate(
     unasked = sorted({target.category for target in targets} - set(categories))
     if unasked:
         raise InputError(
-            f"tdf evaluate: --meshes has a {unasked[0]}; expected {', '.join(categories)} only; add it to --category, or "
-            "move it away"
+            f"tdf evaluate: --meshes has a {unasked[0]}; expected {', '.join(categories)} only; add it to --category, "
+            "or move it away"
         )
     makers = {}
     for name in categories:
@@ -201,6 +201,7 @@ def _draw(folder: Path, model: "Model", outcomes: "Outcomes") -> None:
 
 
 def _panel(model: "Model", outcome: "Outcome", index: int) -> "Panel":
+    import jax.numpy as jnp
     import numpy as np
 
     from tdf_jax.evaluation.cases import QUERY_SIZE
@@ -211,7 +212,7 @@ def _panel(model: "Model", outcome: "Outcome", index: int) -> "Panel":
     from tdf_jax.viz.reconstruction import Panel
 
     case, iou = outcome.cases[index], outcome.ious["iou_refined"][index]
-    T_world_b = case.T_world_b
+    T_world_b, points = case.T_world_b, jnp.asarray(case.points_b)
     estimate, T_world_estimate = outcome.estimates[index], np.eye(4)
     T_world_estimate[:3, :3], T_world_estimate[:3, 3] = se3.rotation(estimate), estimate[4:]
     return Panel(
@@ -220,7 +221,7 @@ def _panel(model: "Model", outcome: "Outcome", index: int) -> "Panel":
         error=f"{100 * outcome.distance[index]:.1f} cm, {outcome.angle[index]:.0f}° off",
         triangles=np.asarray(case.object_b.mesh.triangles),
         reconstructed=surface_triangles(
-            refine(model, encode(model, case.points_b), case.points_b), T_world_b, case.object_b.mesh.bounds
+            refine(model, encode(model, points), points), T_world_b, case.object_b.mesh.bounds
         ),
         T_object_true=np.linalg.inv(T_world_b) @ case.T_world_place_b,
         T_object_estimate=np.linalg.inv(T_world_b) @ T_world_estimate,

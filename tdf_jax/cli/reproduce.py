@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar, get_args
 
 import tyro
 from tqdm import tqdm
@@ -16,7 +16,8 @@ from tdf_jax.paper.runs import Run
 from tdf_jax.paper.setting import Setting, scene
 from tdf_jax.paper.store import Store
 
-EXPERIMENTS = ("table1", "fig1", "fig2", "fig3", "fig4", "fig5")
+Experiment = Literal["table1", "fig1", "fig2", "fig3", "fig4", "fig5", "all"]
+EXPERIMENTS = get_args(Experiment)[:-1]
 # Settings that an experiment chooses itself. "all" chooses all of them.
 CHOSEN = {
     "table1": ("trajectory", "displacement"),
@@ -32,13 +33,13 @@ FAST = {"num_starts": 2, "iterations": 60, "queries": 24}
 
 
 def reproduce(
-    experiment: Annotated[Literal[*EXPERIMENTS, "all"], tyro.conf.Positional],
+    experiment: Annotated[Experiment, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("reproduction"),
     fast: bool = False,
     weights: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "mug",
     setting: Annotated[Setting, tyro.conf.arg(name="")] = Setting(),
 ) -> None:
-    """Regenerate the table and the figures of the paper with generated mugs; docs/results/paper.md explains the numbers.
+    """Regenerate the table and figures of the paper with generated mugs; docs/results/paper.md explains the numbers.
 
     A run that was interrupted computes only what is missing.
 
@@ -53,7 +54,8 @@ def reproduce(
     names = EXPERIMENTS if experiment == "all" else (experiment,)
     for name in dict.fromkeys(field for one in names for field in CHOSEN[one]):
         if getattr(setting, name) != getattr(Setting(), name):
-            raise InputError(f"tdf reproduce: --{name.replace('_', '-')} is set, but {experiment} chooses it itself; drop it")
+            flag = name.replace("_", "-")
+            raise InputError(f"tdf reproduce: --{flag} is set, but {experiment} chooses it itself; drop it")
     if fast:
         untouched = {name: value for name, value in FAST.items() if getattr(setting, name) == getattr(Setting(), name)}
         setting = dataclasses.replace(setting, **untouched)
@@ -71,7 +73,7 @@ def reproduce(
 def _table1(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
     plan = table.planned(base, 1, table.FAST_VARIATIONS) if fast else table.planned(base)
     settings = [setting for _, chosen in plan for setting in chosen]
-    _run_all(store, settings, "table 1")
+    _run_all(store, dict(enumerate(settings)), "table 1")
     rows = table.rows(store.run, plan)
     yield _text(out / "table1.md", table.as_markdown(rows))
     yield _text(out / "table1.csv", table.as_csv(rows))
@@ -122,17 +124,19 @@ def _fig5(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
 _COMMANDS: dict[str, Callable] = dict(zip(EXPERIMENTS, (_table1, _fig1, _fig2, _fig3, _fig4, _fig5)))
 
 
-def _run_all(store: Store, settings, words: str) -> dict[object, Run]:
-    """Runs of settings, with a progress bar; those of a mapping by its keys, those of a sequence by their number."""
-    named = settings if isinstance(settings, dict) else dict(enumerate(settings))
-    with tqdm(total=len(named), desc=words, unit="run") as bar:
+Key = TypeVar("Key")
+
+
+def _run_all(store: Store, settings: dict[Key, Setting], words: str) -> dict[Key, Run]:
+    """Runs of settings by the same keys, with a progress bar."""
+    with tqdm(total=len(settings), desc=words, unit="run") as bar:
 
         def run(setting):
             result = store.run(setting)
             bar.update()
             return result
 
-        return figures.collected(run, named)
+        return figures.collected(run, settings)
 
 
 def _picture(path: Path, figure) -> Path:

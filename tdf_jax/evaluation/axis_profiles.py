@@ -132,15 +132,16 @@ def _axis(mesh, shares: tuple[float, float], name: str) -> np.ndarray:
     low, high = mesh.bounds[:, 2]
     levels = low + (high - low) * (shares[0] + (shares[1] - shares[0]) * (np.arange(AXIS_LEVELS) + 0.5) / AXIS_LEVELS)
     cuts = (
-        mesh_plane(mesh, plane_normal=[0, 0, 1], plane_origin=[0, 0, level])[..., :2].reshape(-1, 2) for level in levels
+        np.asarray(mesh_plane(mesh, plane_normal=[0, 0, 1], plane_origin=[0, 0, level]))[..., :2].reshape(-1, 2)
+        for level in levels
     )
     # The middle of an outline is its axis for every symmetry. The mean of its points depends on how densely each side
     # was scanned, and the middle of the whole bounding box depends on stray vertices and on a leaning rim.
     middles = [(cut.min(axis=0) + cut.max(axis=0)) / 2 for cut in cuts if len(cut)]
     if not middles:
         raise InputError(
-            f"profile(): {name} has no surface from {100 * shares[0]:.0f} to {100 * shares[1]:.0f} % of its height, where "
-            "its axis is measured; expected one; repair the mesh, or correct its 'up'"
+            f"profile(): {name} has no surface from {100 * shares[0]:.0f} to {100 * shares[1]:.0f} % of its height, "
+            "where its axis is measured; expected one; repair the mesh, or correct its 'up'"
         )
     return np.median(middles, axis=0)
 
@@ -193,9 +194,9 @@ def _check_symmetry(around: np.ndarray, bounds: np.ndarray, fold: int, name: str
     changes = [np.nanquantile(np.abs(around - np.roll(around, round(turn * DIRECTIONS))), 0.9) for turn in TURNS[fold]]
     if max(changes) > CHANGE:
         raise InputError(
-            f"profile(): {name} is not {FOLDS[fold]}: a turn of {360 * TURNS[fold][np.argmax(changes)]:g} degrees about "
-            f"'up' changes its outline by {100 * max(changes):.0f} % of its radius; expected {100 * CHANGE:.0f} % at "
-            "most; correct 'symmetry' or 'up'"
+            f"profile(): {name} is not {FOLDS[fold]}: a turn of {360 * TURNS[fold][np.argmax(changes)]:g} degrees "
+            f"about 'up' changes its outline by {100 * max(changes):.0f} % of its radius; expected "
+            f"{100 * CHANGE:.0f} % at most; correct 'symmetry' or 'up'"
         )
 
 

@@ -17,7 +17,7 @@ from tdf_jax.evaluation.cases import Case
 from tdf_jax.geometry import se3
 
 if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
 METHODS = ("PCA", "ICP")
 MAX_STEPS = 100  # of ICP
@@ -37,10 +37,10 @@ def principal_axes(
     Returns:
         The motion of cloud a onto cloud b, 4x4.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     axes_a, axes_b = _axes(points_a), _axes(points_b)
-    tree_b = cKDTree(points_b)
+    tree_b = KDTree(points_b)
     motions = [_motion((axes_b * signs) @ axes_a.T, points_a.mean(axis=0), points_b.mean(axis=0)) for signs in SIGNS]
     distances = [chamfer_distance(_moved(T, points_a), points_b, tree_b) for T in motions]
     return motions[int(np.argmin(distances))]
@@ -85,10 +85,10 @@ def every_registration(
     Returns:
         Motions of cloud a onto cloud b, (starts, 4, 4), and their mean squared distances, (starts,), square metres.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     points_a, points_b = np.asarray(points_a, float), np.asarray(points_b, float)
-    tree_a = cKDTree(points_a)
+    tree_a = KDTree(points_a)
     starts = [_motion(R, points_a.mean(axis=0), points_b.mean(axis=0)) for R in rotations]
     motions, costs = zip(*(_icp(np.linalg.inv(T), points_a, points_b, tree_a) for T in starts))
     return np.linalg.inv(motions), np.array(costs)
@@ -112,7 +112,7 @@ def rigid_motion(
 
 
 def chamfer_distance(
-    points_a: Float[np.ndarray, "points 3"], points_b: Float[np.ndarray, "seen 3"], tree_b: "cKDTree | None" = None
+    points_a: Float[np.ndarray, "points 3"], points_b: Float[np.ndarray, "seen 3"], tree_b: "KDTree | None" = None
 ) -> float:
     """Mean distance of points to their nearest neighbours in the other cloud, metres, averaged over both directions.
 
@@ -121,10 +121,10 @@ def chamfer_distance(
         points_b: the other cloud, (seen, 3), metres.
         tree_b: search tree of `points_b`, if there is one already.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    tree_b = cKDTree(points_b) if tree_b is None else tree_b
-    return float(tree_b.query(points_a)[0].mean() + cKDTree(points_a).query(points_b)[0].mean()) / 2
+    tree_b = KDTree(points_b) if tree_b is None else tree_b
+    return float(tree_b.query(points_a)[0].mean() + KDTree(points_a).query(points_b)[0].mean()) / 2
 
 
 def aligned(

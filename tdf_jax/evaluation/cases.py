@@ -2,8 +2,10 @@
 
 import dataclasses
 import zlib
+from typing import cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -102,7 +104,7 @@ def object_of(category: str, seed: int, index: int, size: float, fold: int | Non
 
 def mug_of(seed: int, index: int, height: float) -> Mug:
     """A generated mug that no training run has, scaled to a height in metres."""
-    return object_of("mug", seed, index, height)
+    return cast(Mug, object_of("mug", seed, index, height))
 
 
 def random_pose(seed: int, index: int, reach: float = 0.3) -> Float[np.ndarray, "4 4"]:
@@ -202,7 +204,8 @@ def place_demonstration(
     pick = case.T_world_place_a
     start, end = pick[:3, 3], pick[:3, 3] + np.multiply(goal_offset, case.scale)
     bow = {} if bulge is None or path not in SHAPES or path == "line" else {"bulge": bulge}
-    return Demonstration(case.points_a, PATHS[path](num_poses, start, end, rotation=pick[:3, :3], **bow), query)
+    trajectory = PATHS[path](num_poses, start, end, rotation=pick[:3, :3], **bow)
+    return Demonstration(jnp.asarray(case.points_a), trajectory, query)
 
 
 def _scale(function: str, clouds: str) -> float:

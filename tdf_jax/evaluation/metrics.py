@@ -9,7 +9,7 @@ from tdf_jax.geometry import se3
 from tdf_jax.geometry.symmetry import equivalent
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.geometry.transport import carry_trajectory
-from tdf_jax.shapes import Mug
+from tdf_jax.shapes import Shape
 
 REACH = 0.03  # metres from a place at which equivalent places are compared; half the edge of a query box
 FLIP_DEGREES = 170.0  # a larger rotation error is a flip: the method mistook the object for its mirror image
@@ -19,7 +19,7 @@ def expected_trajectory(
     demonstrated: Trajectory,
     T_world_place_a: Float[np.ndarray, "4 4"],
     T_world_place_b: Float[np.ndarray, "4 4"],
-    goal: Float[Array, "7"],
+    goal: Float[Array | np.ndarray, "7"],
 ) -> Trajectory:
     """The ground truth of an imitation on another object.
 
@@ -38,7 +38,7 @@ def expected_trajectory(
     """
     pick_motion = jnp.asarray(T_world_place_b @ np.linalg.inv(T_world_place_a), demonstrated.wxyz_xyz.dtype)
     pick = se3.compose(se3.pose(pick_motion[:3, :3], pick_motion[:3, 3]), demonstrated.wxyz_xyz[0])
-    return carry_trajectory(demonstrated, pick, goal)
+    return carry_trajectory(demonstrated, pick, jnp.asarray(goal))
 
 
 def nearest_place(
@@ -65,7 +65,9 @@ def nearest_place(
     return T_world_object @ equivalent(estimate, to_object @ T_world_place, fold, REACH)
 
 
-def pose_error(estimate: Float[Array, "... 7"], truth: Float[Array, "... 7"]) -> tuple[np.ndarray, np.ndarray]:
+def pose_error(
+    estimate: Float[Array | np.ndarray, "... 7"], truth: Float[Array | np.ndarray, "... 7"]
+) -> tuple[np.ndarray, np.ndarray]:
     """Position errors, metres, and rotation errors, radians.
 
     Args:
@@ -141,7 +143,7 @@ def longest_step(path: Float[np.ndarray, "poses 3"]) -> float:
 def penetration(
     trajectory: Trajectory,
     query: Float[np.ndarray, "queries 3"],
-    target: Mug | AnnotatedMesh,
+    target: Shape | AnnotatedMesh,
     T_world_target: Float[np.ndarray, "4 4"],
 ) -> float | None:
     """Share of the query points, over all poses, that lie inside the solid of an object.

@@ -258,12 +258,13 @@ def _reliability(reliability: Mapping[str, Any]) -> str:
         else f" In {percent(reliability['ranking'])} of all pairs of a right and a wrong pick, the right one has the "
         "higher confidence."
     )
-    return (
-        f"## Confidence\n\n`result.confidence` of the {reliability['picks']} picks of `{LIBRARY}`, all clouds, in bins. "
+    words = (
+        f"`result.confidence` of the {reliability['picks']} picks of `{LIBRARY}`, all clouds, in bins. "
         f"The curve was fitted on picks of seed {FITTED_ON}. The mean difference of the confidence and the share of "
-        f"right picks is {reliability['calibration_error']:.3f}.{order}\n\n"
-        f"![Reliability]({PICTURES['reliability']})\n\n" + markdown(heads, rows)
+        f"right picks is {reliability['calibration_error']:.3f}.{order}"
     )
+    picture = f"![Reliability]({PICTURES['reliability']})"
+    return "\n\n".join(["## Confidence", words, picture, markdown(heads, rows)])
 
 
 def _demonstrations(counts: Sequence[Mapping[str, Any]]) -> str:

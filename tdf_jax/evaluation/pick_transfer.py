@@ -56,7 +56,7 @@ def transferred(
     estimates = []
     for index, case in enumerate(tqdm(cases, desc="transferring", disable=not progress)):
         reference = place_reference(model, case, box_query(query_key, count=QUERIES, size=QUERY_SIZE * case.scale))
-        field = encode(model, case.points_b)
+        field = encode(model, jnp.asarray(case.points_b))
         key = jax.random.fold_in(start_key, index)
         result = optimize(field, reference, key, fix_last=False, energy=EnergyWeights(0.0), config=config)
         estimates.append(result.trajectory.wxyz_xyz[0])
@@ -106,7 +106,7 @@ def place_reference(model: Model, case: Transfer, query: Float[Array, "queries 3
         case: the transfer.
         query: query points, (queries, 3), metres, query frame.
     """
-    field = encode(model, case.points_a)
+    field = encode(model, jnp.asarray(case.points_a))
     place = jnp.asarray(case.T_world_place_a, jnp.float32)
     T_world_query = se3.pose(place[:3, :3], place[:3, 3])
     demonstrated = Trajectory(T_world_query[None]).shifted(-field.origin)
@@ -138,8 +138,9 @@ def overlaps(
         measured: dict[str, float | None] = dict.fromkeys(OVERLAPS)
         if true is not None:
             world = (x @ case.T_world_b[:3, :3].T + case.T_world_b[:3, 3]).astype(np.float32)
-            field = encode(model, case.points_b)
-            for name, shape in zip(OVERLAPS, (field, refine(model, field, case.points_b))):
+            points = jnp.asarray(case.points_b)
+            field = encode(model, points)
+            for name, shape in zip(OVERLAPS, (field, refine(model, field, points))):
                 measured[name] = _overlap(np.asarray(_occupancy(shape, world)) > 0.5, true)
         for name, iou in measured.items():
             ious[name].append(iou)
@@ -267,7 +268,8 @@ def _by_symmetry(distance, angle, ious, cases, tilt) -> dict:
         chosen = folds == fold
         if not chosen.any():
             continue
-        part = parts[name] = {"cases": int(chosen.sum())}
+        part: dict[str, float | None] = {"cases": int(chosen.sum())}
+        parts[name] = part
         for key, several in ious.items():
             known = [iou for iou, of_fold in zip(several, chosen) if of_fold and iou is not None]
             part[key] = float(np.mean(known)) if known else None

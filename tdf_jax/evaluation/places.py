@@ -145,7 +145,7 @@ def _section(mesh) -> np.ndarray:
 
     # The plane is moved by less than the accuracy of any mesh, because vertices, and often whole edges, lie in the
     # plane of symmetry itself.
-    return mesh_plane(mesh, plane_normal=[0, 1, 0], plane_origin=[0, 1e-6, 0])[..., [0, 2]]
+    return np.asarray(mesh_plane(mesh, plane_normal=[0, 1, 0], plane_origin=[0, 1e-6, 0]))[..., [0, 2]]
 
 
 def crossings(section, level: float) -> np.ndarray:

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -48,8 +49,9 @@ def evidence(model: Model, category: str, seed: int, index: int, right: bool) ->
     demonstration = place_demonstration(case, "line", 2, box_query(jax.random.key(seed), QUERIES, QUERY_SIZE))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CategoryWarning)
-        result = imitate(model, demonstration, target.points_b, key=jax.random.key(index), fix_last=False)
-    return float(result.residual), surface_logit(encode(model, target.points_b), target.points_b)
+        points = jnp.asarray(target.points_b)
+        result = imitate(model, demonstration, points, key=jax.random.key(index), fix_last=False)
+    return float(result.residual), surface_logit(encode(model, points), points)
 
 
 def collected(
@@ -85,7 +87,7 @@ def summary(
     rows: Float[np.ndarray, "cases 2"],
     right: Float[np.ndarray, " cases"],
     clouds: Int[np.ndarray, " cases"],
-    curve: Sequence[float],
+    curve: Float[np.ndarray, "3"],
 ) -> dict:
     """The area under the ROC of a curve and of the residual alone, and rates at all `LEVELS`.
 
@@ -93,10 +95,12 @@ def summary(
         rows: residuals and surface logits, (cases, 2).
         right: 1 for right cases, (cases,).
         clouds: numbers of their clouds in `CLOUDS`, (cases,).
-        curve: intercept and both slopes.
+        curve: intercept and both slopes, (3,).
     """
-    intercept, *slopes = map(float, curve)
-    predicted = np.array([recognition(*row, (intercept, slopes[0], slopes[1])) for row in rows])
+    intercept, slope, logit_slope = map(float, curve)
+    predicted = np.array(
+        [recognition(float(residual), float(logit), (intercept, slope, logit_slope)) for residual, logit in rows]
+    )
     rates = {
         str(level): {
             "wrong_noticed": float(np.mean(predicted[right == 0] < level)),
@@ -140,7 +144,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
     parts = [collected(model, category, options.seed, options.count) for category in options.category]
     rows, right, clouds = (np.concatenate(column) for column in zip(*parts))
-    curve = logistic(features(rows), right) if options.fit else CURVES[model.info.name]
+    curve = logistic(features(rows), right) if options.fit else np.array(CURVES[model.info.name])
     settings = {name: value for name, value in vars(options).items() if name != "out"}
     record = header(settings, model) | {"curve": [float(x) for x in curve]} | summary(rows, right, clouds, curve)
     record["categories"] = {category: summary(*part, curve) for category, part in zip(options.category, parts)}

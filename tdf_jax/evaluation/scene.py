@@ -3,6 +3,7 @@
 import dataclasses
 from typing import TYPE_CHECKING
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -48,7 +49,9 @@ class Scene:
         demonstrated, (place_a, place_b) = self.demonstration.trajectory, self.T_world_places
         if pick is not None:
             estimate = (
-                Trajectory(np.asarray(pick)[None]).matrices[0] @ np.linalg.inv(demonstrated.matrices[0]) @ place_a
+                np.asarray(Trajectory(jnp.asarray(pick)[None]).matrices[0])
+                @ np.linalg.inv(demonstrated.matrices[0])
+                @ place_a
             )
             place_b = nearest_place(self.T_world_target, estimate, place_b, self.fold)
         return expected_trajectory(demonstrated, place_a, place_b, goal)

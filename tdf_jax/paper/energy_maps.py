@@ -16,10 +16,10 @@ from tdf_jax.networks.model import Model
 from tdf_jax.paper import setting as settings
 from tdf_jax.paper.setting import SHAPES, Setting
 
-HALF = 1.2  # of the square's side, in the paper's unit
-# degrees about z of the turned mugs, whose true paths so stay in the plane; `Setting.turn` if it is a number
+HALF = 1.2  # half of the edge of the square, in the paper's unit
+# Degrees about z by which a mug is rotated if `Setting.turn` is no number. Its true path then stays in the plane.
 UPRIGHT_TURN = 60.0
-FIELDS = {  # what lies in the field, in words: which mug, and whether it is turned
+FIELDS = {  # the object in the field: number of the mug, and whether it is rotated
     "reference mug": (0, False),
     "test mug": (1, False),
     "reference mug, turned": (0, True),
@@ -29,15 +29,17 @@ FIELDS = {  # what lies in the field, in words: which mug, and whether it is tur
 
 @dataclasses.dataclass(frozen=True)
 class Swept:
-    """One panel: energies in the plane through the demonstration, positions relative to its first pose, in the paper's unit.
+    """One panel: energies in the plane through the demonstration.
+
+    Positions are relative to the first pose, in the paper's unit.
 
     Attributes:
-        x, y: coordinates of the grid.
-        energies: E at (x, y).
-        path: the demonstration's waypoints, relative to the cloud's centre.
-        carried: the same, turned with the mug.
-        minimisers: x_i* of every waypoint.
-        outline: points of the object, projected.
+        x, y: coordinates of the grid, each (count,).
+        energies: E at (x, y), (count, count).
+        path: demonstrated waypoints, moved with the centroid, (poses, 2).
+        carried: the same, rotated with the mug, (poses, 2).
+        minimisers: x_i* of every waypoint, (poses, 2).
+        outline: points of the object, projected, (points, 2).
     """
 
     x: Float[np.ndarray, " count"]
@@ -50,17 +52,16 @@ class Swept:
 
 
 def figure2(model: Model, base: Setting, field: str, count: int = 101) -> dict[str, Swept]:
-    """Landscapes of one field, a panel a shape.
+    """Landscapes of one field, one panel for each shape.
 
-    The query frame has the world's axes, as in the paper: the handle's frame is not tilted. A turned mug is turned
-    about z, and the energy is still that of the world's axes, so its minima lie where both the turned path and the axes
-    are near.
+    The query frame has the axes of the world, as in the paper. A rotated mug is rotated about z, and the energy is
+    still that of the axes of the world, so its minima lie where both the rotated path and the axes are near.
 
     Args:
         model: the network.
         base: all other numbers.
         field: one of `FIELDS`.
-        count: points along a side of the grid.
+        count: number of points along a side of the grid.
     """
     which, turn = FIELDS[field]
     shapes = {name: dataclasses.replace(base, trajectory=name, turn=0.0) for name in SHAPES}
@@ -70,9 +71,8 @@ def figure2(model: Model, base: Setting, field: str, count: int = 101) -> dict[s
     degrees = (UPRIGHT_TURN if base.turn == "any" else base.turn) if turn else 0.0
     R = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
     points = ((scene.points if which else scene.demonstration.points) @ R.T).astype(np.float32)
-    seen = encode(model, points)
-    # The paths are relative to the clouds' centres, as in the losses: on another mug they lie where its centre takes
-    # them.
+    seen = encode(model, jnp.asarray(points))
+    # Paths are relative to the centroids of the clouds, as in the losses, so they move with the centroid of a mug.
     paths = {
         name: np.asarray(reference.trajectory.translations + seen.origin) for name, reference in references.items()
     }
@@ -100,7 +100,7 @@ def figure2(model: Model, base: Setting, field: str, count: int = 101) -> dict[s
 
 
 def _joined(references):
-    """One sweep for all shapes: they share the query points and the field."""
+    """One reference for all shapes, because they share the query points and the field."""
     return Reference(
         jnp.concatenate([one.descriptors for one in references]),
         Trajectory(jnp.concatenate([one.trajectory.wxyz_xyz for one in references])),

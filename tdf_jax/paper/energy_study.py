@@ -7,6 +7,8 @@ only what is missing.
 """
 
 import argparse
+import dataclasses
+import functools
 import json
 import sys
 import time
@@ -15,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from tdf_jax._internal.errors import InputError
@@ -65,7 +68,7 @@ def pair_problem(model: Model, index: int) -> Problem:
     query = box_query(jax.random.key(index), QUERIES, QUERY_SIZE)
     shape = list(SHAPES)[index % len(SHAPES)]
     reference = describe(model, place_demonstration(case, shape, 7, query, goal_offset=GOAL, bulge=None))
-    field = encode(model, case.points_b)
+    field = encode(model, jnp.asarray(case.points_b))
     arguments = {"goal": default_goal(field, reference), "energy": EnergyWeights()}
     return Problem(field, reference, arguments, OptimizeConfig())
 
@@ -78,10 +81,11 @@ def row_problem(model: Model, index: int) -> Problem:
         index: number of the row.
     """
     shape, displacement = list(PAPER)[index]
-    setting = settings.Setting(trajectory=shape, displacement=displacement, num_starts=10, queries=QUERIES)
+    setting = settings.Setting(displacement=displacement, num_starts=10, queries=QUERIES)
+    setting = dataclasses.replace(setting, trajectory=shape)
     scene = settings.scene(setting)
     reference = settings.aim(setting, describe(model, scene.demonstration))
-    field = encode(model, scene.points)
+    field = encode(model, jnp.asarray(scene.points))
     arguments = {"goal": settings.goal(setting, field, reference), "energy": setting.energy}
     return Problem(field, reference, arguments, setting.optimiser)
 
@@ -94,13 +98,14 @@ def compare(problem: Problem, seed: int) -> dict[str, dict[str, float]]:
         seed: seed of the starts.
     """
     field, reference, arguments, config = problem
+    solver_config = SolveConfig(start=config.start, start_radius=config.start_radius)
     energies = {}
-    for name, minimise, settings_of in (
-        ("adam", optimize, config),
-        ("solve", solve, SolveConfig(start=config.start, start_radius=config.start_radius)),
+    for name, minimise in (
+        ("adam", functools.partial(optimize, config=config)),
+        ("solve", functools.partial(solve, config=solver_config)),
     ):
         begin = time.perf_counter()
-        energy = float(minimise(field, reference, jax.random.key(seed), config=settings_of, **arguments).loss)
+        energy = float(minimise(field, reference, jax.random.key(seed), **arguments).loss)
         energies[name] = {"energy": energy, "seconds": time.perf_counter() - begin}
     return energies
 

@@ -1,6 +1,7 @@
 """One imitation of the paper, and its errors."""
 
 import dataclasses
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ from tdf_jax.energy.losses import descriptor_loss, trajectory_energy
 from tdf_jax.energy.reference import describe
 from tdf_jax.evaluation.metrics import FLIP_DEGREES, longest_step, pose_error, shape_error
 from tdf_jax.geometry.grid import distance_from_polyline
+from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.model import Model
 from tdf_jax.paper import setting as settings
@@ -68,7 +70,7 @@ class Run:
 
     @property
     def settled(self) -> int:
-        """Number of iterations after which the loss of the best start has fallen by `SETTLED` of its total drop, for good."""
+        """Number of iterations after which the loss of the best start stays below a `SETTLED` share of its drop."""
         curve = self.losses[self.best]
         limit = curve[0] - SETTLED * (curve[0] - curve[-1])
         above = np.flatnonzero(curve > limit)
@@ -119,15 +121,15 @@ def imitation(model: Model, setting: Setting) -> Run:
     """
     scene = settings.scene(setting)
     reference = describe(model, scene.demonstration)
-    field = encode(model, scene.points)
+    field = encode(model, jnp.asarray(scene.points))
     goal = settings.goal(setting, field, reference)
     reference = settings.aim(setting, reference)
     key = jax.random.fold_in(jax.random.key(setting.seed), settings.STREAM + 1)
     result = optimize(
         field, reference, key, goal=goal, fix_last=setting.fix_last, energy=setting.energy, config=setting.optimiser
     )
-    expected = scene.expected(goal)
-    dense = settings.scene(dataclasses.replace(setting, num_poses=DENSE)).expected(goal)
+    expected = cast(Trajectory, scene.expected(goal))
+    dense = cast(Trajectory, settings.scene(dataclasses.replace(setting, num_poses=DENSE)).expected(goal))
     estimate = result.trajectory
     weights = jax.tree.map(lambda weight: jnp.asarray(weight, jnp.float32), setting.energy)
     return Run(

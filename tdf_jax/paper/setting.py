@@ -2,9 +2,10 @@
 
 import dataclasses
 import functools
-from typing import Literal
+from typing import Literal, cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -154,7 +155,7 @@ def mug(setting: Setting, which: int) -> Mug:
 @functools.lru_cache(8)
 def _mug(seed, which, diagonal):
     drawn = mug_of(seed, 2 * STREAM + which, 0.1)
-    return scaled(drawn, diagonal / np.linalg.norm(drawn.mesh.extents))
+    return cast(Mug, scaled(drawn, float(diagonal / np.linalg.norm(drawn.mesh.extents))))
 
 
 def rotation(setting: Setting) -> Float[np.ndarray, "3 3"]:
@@ -163,7 +164,7 @@ def rotation(setting: Setting) -> Float[np.ndarray, "3 3"]:
 
     rng = np.random.default_rng([STREAM, setting.seed, 0])
     if setting.turn == "any":
-        return Rotation.random(random_state=rng).as_matrix()
+        return Rotation.random(None, rng).as_matrix()
     axis = rng.normal(size=3)
     return Rotation.from_rotvec(np.radians(setting.turn) * axis / np.linalg.norm(axis)).as_matrix()
 
@@ -205,7 +206,7 @@ def scene(setting: Setting) -> Scene:
         T_world_b[:3, 3] = setting.offset
     trajectory = demonstrated(setting, a.handle_frame, points_a.mean(axis=0))
     return Scene(
-        demonstration=Demonstration(points_a, trajectory, query(setting)),
+        demonstration=Demonstration(jnp.asarray(points_a), trajectory, query(setting)),
         points=(points_b @ T_world_b[:3, :3].T + T_world_b[:3, 3]).astype(np.float32),
         T_world_target=T_world_b,
         T_world_places=(a.handle_frame, T_world_b @ b.handle_frame),

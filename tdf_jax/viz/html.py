@@ -1,11 +1,11 @@
-"""Pages that open in a browser."""
+"""Interactive pages for a browser."""
 
 import io
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
-import matplotlib
+import matplotlib.colors
 import numpy as np
 
 from tdf_jax._internal.errors import InputError
@@ -25,23 +25,21 @@ from tdf_jax.viz.landscapes import (
 )
 from tdf_jax.viz.style import CENTIMETRES, CLOUD
 
-if TYPE_CHECKING:
-    pass
-
 
 def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title: str = "") -> None:
-    """Write an .html page that opens without a network: a plane as a surface of energies, a volume as surfaces of equal energy, to turn, zoom
-    and read numbers from.
+    """Write an interactive .html page of a landscape that opens without a network.
+
+    A plane is drawn as a surface of energies, a volume as surfaces of equal energy.
 
     Args:
-        path: the file; it appears only once it is whole.
-        landscape: of a grid with two or three axes, in one orientation or the best of several.
-        marks: what to draw with it.
-        title: of the page.
+        path: the file, in an existing folder; it appears only once it is complete.
+        landscape: landscape of a grid with two or three axes, in one orientation or the best of several.
+        marks: marks on the landscape.
+        title: title of the page.
 
     Raises:
-        InputError: the grid has one axis, each rotation was kept, plotly (or, for a volume, libigl) is not installed,
-            or the file cannot be written.
+        InputError: the grid has one axis, the landscape keeps every rotation, plotly (or, for a volume, libigl) is not
+            installed, or the file cannot be written.
     """
     plotly = pages("save_page()")
     grid = landscape.grid
@@ -50,10 +48,10 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
     scale = {"colorscale": "Viridis", "colorbar": {"title": "energy"}}
     if energy.ndim == 2:
         x, y, z = np.moveaxis(points, -1, 0)
-        drawn = [plotly.Surface(x=x, y=y, z=z, surfacecolor=energy, opacity=0.85, name="energy", **scale)]
+        drawn: list[Any] = [plotly.Surface(x=x, y=y, z=z, surfacecolor=energy, opacity=0.85, name="energy", **scale)]
     else:
         drawn = []
-        # Surfaces of our own: plotly's know only grids along its axes.
+        # plotly draws surfaces of equal energy for grids along its own axes only.
         for share, colour in zip(LEVELS, SURFACES):
             x, y, z = CENTIMETRES * isosurface(landscape, share).reshape(-1, 3).T
             i, j, k = np.arange(len(x)).reshape(-1, 3).T
@@ -99,6 +97,9 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
 
 def pages(function: str):
     """The plotly module that draws pages.
+
+    Args:
+        function: name that the error message begins with.
 
     Raises:
         InputError: it is not installed.

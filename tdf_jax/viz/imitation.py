@@ -1,4 +1,4 @@
-"""Figures of an imitation, in matplotlib and without its global state: each function returns a `Figure`."""
+"""Figures of an imitation, without the global state of matplotlib: each function returns a `Figure`."""
 
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.viz.scene3d import View, bounds, content, draw, frame, triangles_of, waypoint_bar
-from tdf_jax.viz.style import CLOUD, COLOURS, STYLE, blank_figure, legend_of
+from tdf_jax.viz.style import CLOUD, COLOURS, STYLE, add_axes3d, blank_figure, legend_of
 
 if TYPE_CHECKING:
     import trimesh
@@ -29,14 +29,14 @@ def imitation_figure(
 
     Args:
         demonstration: the reference.
-        points: the test object's cloud, metres, world frame.
-        trajectory: found on the test object.
-        expected: the true one, drawn dashed.
-        meshes: of the reference's and the test's object, metres, world frame; drawn instead of the points.
-        title: above both.
+        points: cloud of the test object, (points, 3), metres, world frame.
+        trajectory: trajectory on the test object.
+        expected: ground truth, drawn dashed.
+        meshes: meshes of the reference and the test object, metres, world frame; drawn instead of the points.
+        title: title above both panels.
 
     Returns:
-        The figure; its axes are the reference, the test and the colour bar.
+        The figure; its axes are those of the reference, of the test and of the colour bar.
     """
     box = bounds(np.asarray(demonstration.query))
     triangles = [triangles_of(mesh) for mesh in meshes]
@@ -50,7 +50,7 @@ def imitation_figure(
         figure = blank_figure(7.2, 4.5)
         legend = {}
         for column, (name, view) in enumerate(views.items()):
-            axes = figure.add_axes((0.5 * column - 0.005, 0.17, 0.46, 0.74), projection="3d")
+            axes = add_axes3d(figure, (0.5 * column - 0.005, 0.17, 0.46, 0.74))
             draw(axes, view, box)
             frame(axes, contents[column], size)
             axes.set_title(name, y=0.99)
@@ -68,10 +68,10 @@ def loss_figure(
     """Loss against iteration of every start, as in figure 5 of the paper.
 
     Args:
-        losses: energies; a start that became non-finite ends there.
-        best: the start drawn bold.
-        title: above.
-        rows: what a row is called; the solver's are candidates.
+        losses: energies, (starts, iterations); the curve of a start ends where it becomes non-finite.
+        best: number of the start that is drawn bold.
+        title: title above the axes.
+        rows: name of a row in the legend; the rows of the solver are candidates.
     """
     losses = np.asarray(losses)
     steps = np.arange(losses.shape[1])

@@ -1,14 +1,16 @@
-"""Pictures of energy landscapes: maps of planes, surfaces of equal energy in volumes, an animated slice, and a page to turn by hand."""
+"""Pictures of energy landscapes: maps of planes, and surfaces of equal energy and animated slices of volumes."""
 
 import dataclasses
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from tdf_jax._internal.errors import InputError
@@ -16,7 +18,19 @@ from tdf_jax._internal.files import replace_file
 from tdf_jax.geometry.winding import libigl
 from tdf_jax.landscape.storage import Landscape
 from tdf_jax.viz import polygons3d
-from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, LIGHT, STYLE, TRUTH, blank_figure, legend_of
+from tdf_jax.viz.style import (
+    CENTIMETRES,
+    CLOUD,
+    COLOURS,
+    INK,
+    LIGHT,
+    STYLE,
+    TRUTH,
+    add_axes3d,
+    blank_figure,
+    legend_of,
+    set_view,
+)
 
 if TYPE_CHECKING:
     import trimesh
@@ -24,26 +38,26 @@ if TYPE_CHECKING:
 COLUMNS = 4
 PANEL = 1.75  # inches
 CONTOURS = 12
-NEAR = 1.5  # steps off the plane within which an object's points are drawn on a map
-LEVELS = (0.02, 0.10)  # shares of a volume that lie within its surfaces of equal energy
+NEAR = 1.5  # steps of the grid; points of an object within this distance of the plane are drawn on a map
+LEVELS = (0.02, 0.10)  # shares of a volume inside its surfaces of equal energy
 SURFACES = COLOURS(0.15), COLOURS(0.75)
 SEE_THROUGH = 0.30
-PANELS = 24  # of waypoints on a map; of more, so many evenly spread
+MAX_PANELS = 24  # of waypoints on a map; more waypoints are subsampled evenly
 FRAMES_A_SECOND = 8
 GIF_DPI = 100
-SHOWN = 1500  # points of an object's cloud
-ANGLES = {"elev": 22, "azim": -38}
+SHOWN = 1500  # points of an object's cloud that are drawn
+ANGLES = {"elev": 22.0, "azim": -38.0}
 
 
 @dataclasses.dataclass(frozen=True)
 class Marks:
-    """What is drawn on a landscape, metres, world frame.
+    """Marks on a landscape, metres, world frame.
 
     Attributes:
-        points: the object's cloud.
-        mesh: its surface, if known; drawn in volumes instead of the points.
-        expected: where the waypoints ought to be, if known.
-        path: the lowest-cost path, if there is one.
+        points: cloud of the object, (points, 3).
+        mesh: surface of the object, if known; volumes show it instead of the points.
+        expected: true waypoints, (poses, 3), if known.
+        path: lowest-cost path, (corners, 3), if there is one.
     """
 
     points: Float[np.ndarray, "points 3"]
@@ -53,18 +67,18 @@ class Marks:
 
 
 def map_figure(landscape: Landscape, marks: Marks, title: str = "") -> Figure:
-    """A plane: the combined energy, then every waypoint's, with contours, minimisers and paths.
+    """A plane: the combined energy and that of every waypoint, with contours, minimisers and paths.
 
     Args:
-        landscape: of a grid with two axes, in one orientation or the best of several.
-        marks: what to draw on it.
-        title: over the picture.
+        landscape: landscape of a grid with two axes, in one orientation or the best of several.
+        marks: marks on the landscape.
+        title: title above the picture.
 
     Raises:
-        InputError: the grid has one or three axes, or each rotation was kept.
+        InputError: the grid has one or three axes, or the landscape keeps every rotation.
     """
     check_landscape("map_figure", landscape, axes=2)
-    shown = np.unique(np.linspace(0, len(landscape.values) - 1, PANELS).round().astype(int))
+    shown = np.unique(np.linspace(0, len(landscape.values) - 1, MAX_PANELS).round().astype(int))
     panels = {"all waypoints": landscape.combined} | {f"waypoint {index}": landscape.values[index] for index in shown}
     columns = min(COLUMNS, len(panels))
     rows = -(-len(panels) // columns)
@@ -102,27 +116,26 @@ def map_figure(landscape: Landscape, marks: Marks, title: str = "") -> Figure:
 
 
 def isosurface_figure(landscape: Landscape, marks: Marks, title: str = "") -> Figure:
-    """A volume: the surfaces within which the combined energy is among the least 2 % and 10 %, with the object and the paths.
+    """A volume: surfaces around the lowest 2 % and 10 % of the combined energy, with the object and the paths.
 
     Args:
-        landscape: of a grid with three axes, in one orientation or the best of several.
-        marks: what to draw with it.
-        title: over the picture.
+        landscape: landscape of a grid with three axes, in one orientation or the best of several.
+        marks: marks on the landscape.
+        title: title above the picture.
 
     Raises:
-        InputError: the grid has one or two axes, each rotation was kept, or libigl is not installed.
+        InputError: the grid has one or two axes, the landscape keeps every rotation, or libigl is not installed.
     """
     check_landscape("isosurface_figure", landscape, axes=3)
     with matplotlib.rc_context(STYLE):
         figure = blank_figure(6.5, 5.6)
-        axes = figure.add_axes((0.0, 0.12, 1.0, 0.84), projection="3d")
+        axes = add_axes3d(figure, (0.0, 0.12, 1.0, 0.84))
         pieces = polygons3d.Pieces([], [], [])
         if marks.mesh is not None:
             pieces += polygons3d.surface(CENTIMETRES * np.asarray(marks.mesh.triangles), LIGHT)
         else:
-            axes.scatter(
-                *(CENTIMETRES * marks.points[:: max(1, len(marks.points) // SHOWN)].T), s=1.5, color=CLOUD, linewidths=0
-            )
+            cloud, size = marks.points[:: max(1, len(marks.points) // SHOWN)], cast(Any, 1.5)
+            axes.scatter(*(CENTIMETRES * cloud.T), s=size, color=CLOUD, linewidths=0)
         for share, colour in zip(LEVELS, SURFACES):
             triangles = CENTIMETRES * isosurface(landscape, share)
             count = len(triangles)
@@ -135,12 +148,8 @@ def isosurface_figure(landscape: Landscape, marks: Marks, title: str = "") -> Fi
         axes.add_collection3d(pieces.collection())
         for points, style in path_lines(landscape, marks, CLOUD):
             axes.plot(*(CENTIMETRES * points.T), zorder=10, **style)
-        corners = (
-            CENTIMETRES
-            * landscape.grid.points[
-                :: landscape.grid.shape[0] - 1, :: landscape.grid.shape[1] - 1, :: landscape.grid.shape[2] - 1
-            ]
-        )
+        first, second, third = (slice(None, None, count - 1) for count in landscape.grid.shape)
+        corners = CENTIMETRES * landscape.grid.points[first, second, third]
         low, high = corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)
         axes.set(
             xlim=(low[0], high[0]),
@@ -150,8 +159,7 @@ def isosurface_figure(landscape: Landscape, marks: Marks, title: str = "") -> Fi
             ylabel="y (cm)",
             zlabel="z (cm)",
         )
-        axes.set_box_aspect(high - low, zoom=1.1)
-        axes.view_init(**ANGLES)
+        set_view(axes, high - low, 1.1, ANGLES)
         legend = legend_of(axes)
         figure.legend(legend.values(), legend.keys(), loc="lower center", ncols=3, frameon=False)
         figure.suptitle(title)
@@ -159,22 +167,24 @@ def isosurface_figure(landscape: Landscape, marks: Marks, title: str = "") -> Fi
 
 
 def isosurface(landscape: Landscape, share: float) -> Float[np.ndarray, "faces 3 3"]:
-    """The surface within which the combined energy is least, by marching cubes.
+    """A surface of equal combined energy, by marching cubes.
 
     Args:
-        landscape: of a volume.
-        share: of the points that count, which lie within it.
+        landscape: landscape of a volume.
+        share: share of the points of the grid inside the surface; points outside the grid's mask do not count.
 
     Returns:
-        Triangles, metres, world frame.
+        Triangles, (faces, 3, 3), metres, world frame.
     """
     igl = libigl("isosurface()")
     energy = landscape.combined
     level = float(np.nanquantile(energy, share))
-    # Where points do not count nothing is drawn: they are as high as the highest.
+    # Points outside the mask get the highest energy, so that no surface is drawn there.
     values = np.nan_to_num(energy, nan=np.nanmax(energy)).astype(float)
-    points = landscape.grid.points.transpose(2, 1, 0, 3).reshape(-1, 3)  # the first axis runs fastest
-    vertices, faces, _ = igl.marching_cubes(values.transpose(2, 1, 0).ravel(), points, *landscape.grid.shape, level)
+    points = landscape.grid.points.transpose(2, 1, 0, 3).reshape(-1, 3)  # the first axis is the fastest for libigl
+    vertices, faces, _ = igl.marching_cubes(
+        values.transpose(2, 1, 0).ravel(), points, *map(int, landscape.grid.shape), level
+    )
     return np.asarray(vertices)[np.asarray(faces)].reshape(-1, 3, 3)
 
 
@@ -182,12 +192,12 @@ def save_slices(path: str | os.PathLike, landscape: Landscape, marks: Marks) -> 
     """Write an animated .gif: the combined energy of a volume, slice by slice along its third axis.
 
     Args:
-        path: the file; it appears only once it is whole.
-        landscape: of a grid with three axes, in one orientation or the best of several.
-        marks: what to draw on it; of the object, the points near each slice.
+        path: the file, in an existing folder; it appears only once it is complete.
+        landscape: landscape of a grid with three axes, in one orientation or the best of several.
+        marks: marks on the landscape; each slice shows the points of the object near it.
 
     Raises:
-        InputError: the grid has one or two axes, each rotation was kept, or the file cannot be written.
+        InputError: the grid has one or two axes, the landscape keeps every rotation, or the file cannot be written.
     """
     check_landscape("save_slices", landscape, axes=3)
     grid, energy = landscape.grid, landscape.combined
@@ -199,7 +209,7 @@ def save_slices(path: str | os.PathLike, landscape: Landscape, marks: Marks) -> 
         figure = blank_figure(4.6, 4.2, layout="constrained")
         axes = figure.subplots()
         figure.colorbar(
-            matplotlib.cm.ScalarMappable(matplotlib.colors.Normalize(low, high), COLOURS),
+            ScalarMappable(Normalize(low, high), COLOURS),
             ax=axes,
             label="energy (no unit)",
         )
@@ -221,7 +231,7 @@ def save_slices(path: str | os.PathLike, landscape: Landscape, marks: Marks) -> 
 
         animation = FuncAnimation(figure, draw, frames=len(heights), init_func=lambda: ())
         path = Path(path)
-        part = path.with_name(f".{path.stem}.part.gif")  # the writer wants a name that ends in .gif
+        part = path.with_name(f".{path.stem}.part.gif")  # the writer requires a name that ends in .gif
         try:
             animation.save(part, writer=PillowWriter(fps=FRAMES_A_SECOND), dpi=GIF_DPI)
             replace_file("save_slices", path, part.read_bytes())
@@ -233,12 +243,22 @@ def save_slices(path: str | os.PathLike, landscape: Landscape, marks: Marks) -> 
             part.unlink(missing_ok=True)
 
 
-def check_landscape(function, landscape, axes):
+def check_landscape(function: str, landscape: Landscape, axes: int) -> None:
+    """Check that a landscape can be drawn.
+
+    Args:
+        function: name that the error message begins with.
+        landscape: the landscape.
+        axes: number of axes that its grid must have.
+
+    Raises:
+        InputError: the grid has another number of axes, or the landscape keeps every rotation.
+    """
     if len(landscape.grid.shape) != axes:
         raise InputError(f"{function}(): the grid has {len(landscape.grid.shape)} axes; expected {axes}")
     if landscape.turned is None:
         raise InputError(
-            f"{function}(): the landscape keeps each rotation's energies; expected the best, or one rotation's"
+            f"{function}(): the landscape keeps the energies of every rotation; expected those of the best, or of one"
         )
 
 
@@ -262,7 +282,7 @@ def _map(axes, first, second, energy, low, high):
 
 
 def _mark(axes, landscape, marks, chosen, whole):
-    """Marks on a map: the object's points near the plane, and what lies in it, projected."""
+    """Draw the points of the object near the plane, the paths and the minimisers, projected onto the plane."""
     grid = landscape.grid
 
     def flat(points):
@@ -279,12 +299,18 @@ def _mark(axes, landscape, marks, chosen, whole):
     axes.plot(*flat(landscape.minimisers[chosen]), **({"ms": 5, "mew": 1.3} | _MINIMISERS))
 
 
-_MINIMISERS = {"ls": "", "marker": "x", "color": TRUTH, "label": "waypoints' minimisers"}
+_MINIMISERS: dict[str, Any] = {"ls": "", "marker": "x", "color": TRUTH, "label": "waypoints' minimisers"}
 
 
-def path_lines(landscape, marks, colour="white"):
-    """Points and matplotlib's style of each path, the demonstration's in a colour; the minimisers last."""
-    lines = [
+def path_lines(landscape: Landscape, marks: Marks, colour: str = "white") -> list[tuple[np.ndarray, dict[str, Any]]]:
+    """The points and the line style of every path; the last one is that of the minimisers.
+
+    Args:
+        landscape: the landscape.
+        marks: marks on the landscape.
+        colour: colour of the demonstration.
+    """
+    lines: list[tuple[np.ndarray, dict[str, Any]]] = [
         (
             landscape.waypoints,
             {"color": colour, "marker": "o", "mec": INK, "label": "demonstration, moved with the centroid"},
@@ -298,7 +324,7 @@ def path_lines(landscape, marks, colour="white"):
 
 
 def _axis_name(direction):
-    """x, -y, ... of a world axis, and "along (...)" of another direction."""
+    """The name of a direction: "x" or "-y" for an axis of the world, and "along (...)" for others."""
     axis = int(np.abs(direction).argmax())
     if np.isclose(abs(direction[axis]), 1, atol=1e-6):
         return ("-" if direction[axis] < 0 else "") + "xyz"[axis]

@@ -1,5 +1,6 @@
-"""The paper's figures, drawn from the data of their experiments."""
+"""Figures of the paper, drawn from the data of `tdf_jax.paper`."""
 
+import jax.numpy as jnp
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
@@ -15,35 +16,38 @@ from tdf_jax.viz.scene3d import WIDTH, View, bounds, panels, triangles_of
 from tdf_jax.viz.style import CLOUD, COLOURS, INK, STYLE, TRUTH, blank_figure, legend_of
 
 SHAPE_COLOURS = {"line": COLOURS(0.05), "semicircle": COLOURS(0.5), "wave": COLOURS(0.85)}
-SHAPE_STYLES = {"line": "-", "semicircle": "--", "wave": "-."}  # told apart without colour too
-OUTLINE = 400  # points of an object's outline
+SHAPE_STYLES = {"line": "-", "semicircle": "--", "wave": "-."}  # distinct without colour too
+OUTLINE = 400  # points of an object that are drawn
 
 
 def figure1(runs: dict[str, Run], scene: Scene) -> Figure:
-    """Reference, random start, after l_t only, after l_t + l_c: one start, that which l_t + l_c takes furthest.
+    """Reference, random start, result of l_t alone, and result of l_t + l_c, all of the best start of l_t + l_c.
 
     Args:
-        runs: of `tdf_jax.paper.figures.figure1`.
-        scene: of their setting.
+        runs: runs of `tdf_jax.paper.figures.figure1`.
+        scene: scene of their setting.
     """
     alone, whole = runs["l_t"], runs["l_t + l_c"]
     test = {"points": scene.points, "triangles": triangles_of(scene.meshes[1])}
-    shown = scene.demonstration
-    truth = Trajectory(whole.expected)
+    demonstration = scene.demonstration
+    truth = Trajectory(jnp.asarray(whole.expected))
     views = {
-        "reference": View(shown.points, triangles_of(scene.meshes[0]), shown.trajectory),
-        "random start": View(trajectory=Trajectory(whole.initial_trajectories[whole.best]), **test),
-        r"after $l_t$ alone": View(trajectory=Trajectory(alone.trajectories[whole.best]), expected=truth, **test),
-        r"after $l_t + k\,l_c$": View(trajectory=Trajectory(whole.trajectory), expected=truth, **test),
+        "reference": View(np.asarray(demonstration.points), triangles_of(scene.meshes[0]), demonstration.trajectory),
+        "random start": View(trajectory=Trajectory(jnp.asarray(whole.initial_trajectories[whole.best])), **test),
+        r"after $l_t$ alone": View(
+            trajectory=Trajectory(jnp.asarray(alone.trajectories[whole.best])), expected=truth, **test
+        ),
+        r"after $l_t + k\,l_c$": View(trajectory=Trajectory(jnp.asarray(whole.trajectory)), expected=truth, **test),
     }
-    return panels(list(views.items()), 2, bounds(np.asarray(shown.query)), len(whole.expected))
+    return panels(list(views.items()), 2, bounds(np.asarray(demonstration.query)), len(whole.expected))
 
 
 def figure4(runs: dict[tuple, Run], scenes: dict[tuple, Scene]) -> Figure:
     """Test against reference, six panels.
 
     Args:
-        runs, scenes: by (trajectory, displacement), of `tdf_jax.paper.figures.figure4`.
+        runs: runs by (trajectory, displacement), of `tdf_jax.paper.figures.figure4`.
+        scenes: their scenes, by the same keys.
     """
     views = []
     for (shape, displacement), run in runs.items():
@@ -55,8 +59,8 @@ def figure4(runs: dict[tuple, Run], scenes: dict[tuple, Scene]) -> Figure:
                 View(
                     scene.points,
                     triangles_of(scene.meshes[1]),
-                    Trajectory(run.trajectory),
-                    Trajectory(run.expected),
+                    Trajectory(jnp.asarray(run.trajectory)),
+                    Trajectory(jnp.asarray(run.expected)),
                     scene.demonstration.trajectory,
                 ),
             )
@@ -66,7 +70,11 @@ def figure4(runs: dict[tuple, Run], scenes: dict[tuple, Scene]) -> Figure:
 
 
 def figure4_turn(runs: dict[tuple, Run]) -> Figure:
-    """How the query frame turns along the path: its angle from the demonstration's, found and true."""
+    """Rotation of the query frame from the demonstration along the path, estimated and true.
+
+    Args:
+        runs: runs by (trajectory, displacement), of `tdf_jax.paper.figures.figure4`.
+    """
     with matplotlib.rc_context(STYLE):
         figure = blank_figure(WIDTH, 2.6, layout="constrained")
         displacements = list(dict.fromkeys(displacement for _, displacement in runs))
@@ -80,7 +88,7 @@ def figure4_turn(runs: dict[tuple, Run]) -> Figure:
                         steps, angles, SHAPE_STYLES[shape], color=SHAPE_COLOURS[shape], marker="o", ms=3, label=shape
                     )
                     truth = turned(run.expected, run.reference)
-            axes.plot(steps, truth, color=TRUTH, lw=1, ls=":", label="even turn to the goal")
+            axes.plot(steps, truth, color=TRUTH, lw=1, ls=":", label="even rotation to the goal")
             axes.set_title(
                 "endpoint not displaced" if not any(displacement) else f"endpoint displaced by {vector(displacement)}"
             )
@@ -94,7 +102,11 @@ def figure4_turn(runs: dict[tuple, Run]) -> Figure:
 
 
 def figure5(runs: dict[str, Run]) -> Figure:
-    """Loss against iteration: the best start of each shape, and the range over its starts."""
+    """Loss against iteration: the best start of each shape, and the range over its starts.
+
+    Args:
+        runs: runs by shape, of `tdf_jax.paper.figures.figure5`.
+    """
     with matplotlib.rc_context(STYLE):
         figure = blank_figure(4.8, 3.2, layout="constrained")
         axes = figure.add_subplot()
@@ -112,7 +124,13 @@ def figure5(runs: dict[str, Run]) -> Figure:
 
 
 def figure3(runs: dict[tuple, Run]) -> Figure:
-    """Error against the distance of the query points from the cloud's centre; the paper's three distances are marked."""
+    """Error against the distance of the query points from the centroid of the cloud.
+
+    Dotted lines mark the three distances of the paper.
+
+    Args:
+        runs: runs by (k, distance, seed), of `tdf_jax.paper.figures.figure3`.
+    """
     panels = (
         ("pick pose", "distance from the truth (cm)", lambda run: 100 * run.pick_error[0]),
         ("pick pose", "angle from the truth (degrees)", lambda run: np.degrees(run.pick_error[1])),
@@ -131,20 +149,20 @@ def figure3(runs: dict[tuple, Run]) -> Figure:
             axes.set_xlim(left=0)
             axes.set_ylim(bottom=0)
             _plain(axes)
-        figure.supxlabel("distance of the first query points from the cloud's centre (units)", fontsize=8)
+        figure.supxlabel("distance of the first query points from the centroid of the cloud (units)", fontsize=8)
         legend = legend_of(axes)
         figure.legend(legend.values(), legend.keys(), loc="outside upper center", ncols=3, frameon=False)
     return figure
 
 
 def figure2(fields: dict[str, dict[str, Swept]]) -> Figure:
-    """Energy landscapes, a row a field, a column a shape.
+    """Energy landscapes, one row for each field, and one column for each shape.
 
     Args:
-        fields: what lies in the field, in words -> shape -> its landscape.
+        fields: landscapes by the name of the field and by shape.
     """
     rows, shapes = len(fields), list(next(iter(fields.values())))
-    # One scale for all panels: rows are compared with one another.
+    # All panels have one colour scale, so that rows can be compared.
     low = min(panel.energies.min() for row in fields.values() for panel in row.values())
     high = max(panel.energies.max() for row in fields.values() for panel in row.values())
     with matplotlib.rc_context(STYLE):
@@ -159,7 +177,7 @@ def figure2(fields: dict[str, dict[str, Swept]]) -> Figure:
             axes.set_xlabel("x (units)")
         figure.colorbar(picture, ax=grid, label="energy E (no unit)", shrink=0.9 if rows == 1 else 0.5, pad=0.01)
         legend = legend_of(grid[-1, 0])
-        # White marks need a ground to be seen on.
+        # White marks need a dark background in the legend too.
         figure.legend(
             legend.values(),
             legend.keys(),
@@ -183,12 +201,12 @@ def _landscape(axes, panel: Swept, low: float, high: float):
     axes.plot([], [], ".", color="white", ms=3, label="object's points")
     axes.plot(*panel.path.T, color="white", lw=1.0, marker="o", ms=3, mec=INK, mew=0.4, label="demonstration")
     if not np.array_equal(panel.carried, panel.path):
-        axes.plot(*panel.carried.T, color="white", lw=1.0, ls="--", label="turned with the mug")
+        axes.plot(*panel.carried.T, color="white", lw=1.0, ls="--", label="rotated with the mug")
     for point, marker, label in ((panel.path[0], "s", "start"), (panel.path[-1], "*", "end")):
         axes.plot(
             *point, marker=marker, ls="", color="white", mec=INK, ms=6 if marker == "s" else 10, mew=0.8, label=label
         )
-    # Last: the first of them lies under the mark of the start.
+    # Minimisers are drawn last, because the first one lies under the mark of the start.
     axes.plot(*panel.minimisers.T, ls="", marker="x", color=TRUTH, ms=5, mew=1.3, label=r"minimisers $x_i^*$")
     axes.set_aspect("equal")
     axes.set(xlim=(panel.x[0], panel.x[-1]), ylim=(panel.y[0], panel.y[-1]))

@@ -12,10 +12,10 @@ from matplotlib.lines import Line2D
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from tdf_jax.viz import polygons3d
-from tdf_jax.viz.style import CENTIMETRES, INK, LIGHT, STYLE, TRUTH
+from tdf_jax.viz.style import CENTIMETRES, INK, LIGHT, STYLE, TRUTH, add_axes3d, set_view
 
 ESTIMATE = "#2a6f97"
-VIEW = {"elev": 28, "azim": -55}  # shows the inside of a cup, and its handle to the right
+VIEW = {"elev": 28.0, "azim": -55.0}  # shows the inside of a cup, and its handle to the right
 PIECES = 25  # longest edge of a drawn triangle, as a part of the diagonal; see `solid`
 COLUMNS = 5
 PANEL, WORDS, MARGIN = 1.7, 0.45, 0.35  # inches: edge of a panel, height of the words above it, and around all
@@ -49,7 +49,12 @@ class Panel:
 
 
 def reconstruction_figure(panels: Sequence[Panel], title: str = "") -> Figure:
-    """The true surface of every object above its reconstruction, all at one scale."""
+    """The true surface of every object above its reconstruction, all at one scale.
+
+    Args:
+        panels: the objects.
+        title: title above the panels.
+    """
     contents = [np.concatenate([panel.triangles, panel.reconstructed]).reshape(-1, 3) for panel in panels]
     edge = _edge(contents)
     with matplotlib.rc_context(STYLE):
@@ -67,7 +72,12 @@ def reconstruction_figure(panels: Sequence[Panel], title: str = "") -> Figure:
 
 
 def transfer_figure(panels: Sequence[Panel], title: str = "") -> Figure:
-    """Every object with the box of query points at the true place, dashed, and at the estimated place, at one scale."""
+    """Every object with the box of query points at the true place, dashed, and at the estimated place, at one scale.
+
+    Args:
+        panels: the objects.
+        title: title above the panels.
+    """
     true = [_corners(panel.T_object_true, panel.size) for panel in panels]
     estimated = [_corners(panel.T_object_estimate, panel.size) for panel in panels]
     contents = []
@@ -125,7 +135,7 @@ def _axes(figure: Figure, index: int, rows: int, row: int, label: str) -> Axes3D
     width, height = figure.get_figwidth(), figure.get_figheight()
     if label and index % COLUMNS == 0:
         figure.text((x - 0.12) / width, (y + PANEL / 2) / height, label, rotation=90, va="center", ha="center")
-    return figure.add_axes((x / width, y / height, PANEL / width, PANEL / height), projection="3d")
+    return add_axes3d(figure, (x / width, y / height, PANEL / width, PANEL / height))
 
 
 def _surface(triangles) -> polygons3d.Pieces:
@@ -136,7 +146,7 @@ def _surface(triangles) -> polygons3d.Pieces:
         return polygons3d.Pieces([], [], [])
     corners = triangles.reshape(-1, 3)
     longest = np.linalg.norm(np.ptp(corners, axis=0)) / PIECES
-    vertices, faces = subdivide_to_size(corners, np.arange(len(corners)).reshape(-1, 3), longest, max_iter=20)
+    vertices, faces = subdivide_to_size(corners, np.arange(len(corners)).reshape(-1, 3), longest, max_iter=20)[:2]
     return polygons3d.surface(CENTIMETRES * vertices[faces], LIGHT)
 
 
@@ -166,7 +176,6 @@ def _draw(axes: Axes3D, pieces: polygons3d.Pieces, content, edge: float) -> None
     for name, at in zip("xyz", middle):
         getattr(axes, f"set_{name}lim")(CENTIMETRES * (at - edge / 2), CENTIMETRES * (at + edge / 2))
     axes.set_proj_type("ortho")
-    axes.set_box_aspect((1, 1, 1), zoom=ZOOM)
-    axes.view_init(**VIEW)
+    set_view(axes, (1, 1, 1), ZOOM, VIEW)
     axes.set_axis_off()
     axes.patch.set_visible(False)

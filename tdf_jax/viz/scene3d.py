@@ -1,8 +1,8 @@
-"""An object with a trajectory of query boxes in three dimensions: the panel that several pictures share."""
+"""A three-dimensional panel of an object with a trajectory of query boxes, which several pictures share."""
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
@@ -15,27 +15,39 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.viz import polygons3d
-from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, LIGHT, STYLE, TRUTH, blank_figure, legend_of
+from tdf_jax.viz.style import (
+    CENTIMETRES,
+    CLOUD,
+    COLOURS,
+    INK,
+    LIGHT,
+    STYLE,
+    TRUTH,
+    add_axes3d,
+    blank_figure,
+    legend_of,
+    set_view,
+)
 
 if TYPE_CHECKING:
     import trimesh
 
-WIDTH = 7.2  # inches, a page's text
-SHOWN_POINTS = 1500  # of a cloud; more are a blot at the width of a page
-VIEW = {"elev": 22, "azim": -38}  # the handle faces the reader, the way to the place runs to the right
-MOST_TRIANGLES = 40_000  # of a mesh that is drawn as such: 1 s of matplotlib
+WIDTH = 7.2  # inches, the text of a page
+SHOWN_POINTS = 1500  # of a cloud; more of them run together at the width of a page
+VIEW = {"elev": 22.0, "azim": -38.0}  # the handle faces the reader, and the path runs to the right
+MOST_TRIANGLES = 40_000  # a mesh with more triangles is drawn as points, because matplotlib would take seconds
 
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """One panel, in metres: the object, as triangles where they are known, and the paths.
+    """Content of one panel, metres.
 
     Attributes:
-        points: the object's cloud.
-        triangles: its mesh, drawn instead of the points; see `triangles_of`.
-        trajectory: drawn with its boxes.
-        expected: the true one, drawn dashed.
-        reference: the demonstration's, drawn thin.
+        points: cloud of the object, (points, 3).
+        triangles: mesh of the object, (faces, 3, 3), drawn instead of the points; see `triangles_of`.
+        trajectory: trajectory that is drawn with its boxes.
+        expected: ground truth, drawn dashed.
+        reference: demonstrated trajectory, drawn dotted.
     """
 
     points: Float[np.ndarray, "points 3"]
@@ -46,14 +58,14 @@ class View:
 
 
 def triangles_of(mesh: "trimesh.Trimesh | None") -> Float[np.ndarray, "faces 3 3"] | None:
-    """A mesh's triangles; None where it is missing or has too many to draw."""
+    """Triangles of a mesh, (faces, 3, 3); None if there is no mesh, or if it has too many triangles to draw."""
     if mesh is None or len(mesh.faces) > MOST_TRIANGLES:
         return None
     return np.asarray(mesh.triangles)
 
 
 def bounds(query: Float[np.ndarray, "queries 3"]) -> Float[np.ndarray, "8 3"]:
-    """Corners of the query points' bounding box, in the query frame."""
+    """Corners of the bounding box of query points, (8, 3), metres, query frame."""
     low, high = query.min(axis=0), query.max(axis=0)
     return low + polygons3d.CORNERS * (high - low)
 
@@ -65,17 +77,29 @@ def _carried(trajectory, box):
 
 
 def content(view: View, box: Float[np.ndarray, "8 3"]) -> Float[np.ndarray, "points 3"]:
-    """Every point that a view has to show."""
+    """All points that a view shows, (points, 3), metres.
+
+    Args:
+        view: the view.
+        box: corners of the box of query points, (8, 3), metres, query frame.
+    """
     paths = [path for path in (view.trajectory, view.expected, view.reference) if path is not None]
     return np.concatenate([view.points, *(_carried(path, box).reshape(-1, 3) for path in paths)])
 
 
 def draw(axes: Axes3D, view: View, box: Float[np.ndarray, "8 3"]) -> None:
-    """Draw a view's object, boxes and paths."""
+    """Draw the object, the boxes and the paths of a view.
+
+    Args:
+        axes: the axes.
+        view: the view.
+        box: corners of the box of query points, (8, 3), metres, query frame.
+    """
     pieces = polygons3d.Pieces([], [], [])
     if view.triangles is None:
         cloud = view.points[:: -(-len(view.points) // SHOWN_POINTS)]
-        axes.scatter(*(CENTIMETRES * cloud.T), s=2.4, color=CLOUD, linewidths=0, label="object's points")
+        size: Any = 2.4  # square points; the declared type is that of the default
+        axes.scatter(*(CENTIMETRES * cloud.T), s=size, color=CLOUD, linewidths=0, label="object's points")
     else:
         pieces += polygons3d.surface(CENTIMETRES * view.triangles, LIGHT)
     corners = CENTIMETRES * _carried(view.trajectory, box)
@@ -84,8 +108,8 @@ def draw(axes: Axes3D, view: View, box: Float[np.ndarray, "8 3"]) -> None:
     if view.expected is not None:
         pieces += polygons3d.box(CENTIMETRES * _carried(view.expected, box)[0], TRUTH, filled=False, dashed=True)
     axes.computed_zorder = False
-    # `frame` sets the limits. Left to matplotlib, they are taken over polygons padded to one length with uninitialised
-    # memory: once in a while an overflow.
+    # `frame` sets the limits. Matplotlib would take them over polygons padded to one length with uninitialised memory,
+    # which sometimes overflows.
     axes.add_collection3d(pieces.collection(), autolim=False)
     line = {"lw": 1.2, "marker": "o", "ms": 2.5}
     if view.expected is not None:
@@ -99,7 +123,13 @@ def draw(axes: Axes3D, view: View, box: Float[np.ndarray, "8 3"]) -> None:
 
 
 def frame(axes: Axes3D, content: Float[np.ndarray, "points 3"], size: Float[np.ndarray, "3"]) -> None:
-    """Equal scale on all axes and in both views; few ticks, so that they do not touch."""
+    """Set equal scales on all axes, and few ticks, so that they do not touch.
+
+    Args:
+        axes: the axes.
+        content: points in the middle of the axes, (points, 3), metres.
+        size: lengths of the axes, (3,), metres; those of several panels are equal.
+    """
     centre = (content.min(axis=0) + content.max(axis=0)) / 2
     for name, middle, length in zip("xyz", CENTIMETRES * centre, CENTIMETRES * size):
         getattr(axes, f"set_{name}lim")(middle - length / 2, middle + length / 2)
@@ -109,22 +139,21 @@ def frame(axes: Axes3D, content: Float[np.ndarray, "points 3"], size: Float[np.n
         axis.set_pane_color((0.97, 0.97, 0.97))
         axis._axinfo["grid"].update(color=(0.87, 0.87, 0.87), linewidth=0.5)
     axes.tick_params(pad=-2, labelsize=7)
-    axes.set_box_aspect(tuple(size), zoom=1.01)  # a copy: matplotlib changes an array in place
     axes.patch.set_visible(False)
-    axes.view_init(**VIEW)
+    set_view(axes, size, 1.01, VIEW)
 
 
 def panels(
-    views: Sequence[tuple[str, View]], columns: int, box: Float[np.ndarray, "8 3"], poses: int, share: float = 0.93
+    views: Sequence[tuple[str, View]], columns: int, box: Float[np.ndarray, "8 3"], num_poses: int, share: float = 0.93
 ) -> Figure:
     """Three-dimensional views at one scale, with a legend below.
 
     Args:
-        views: by their titles, from the upper left.
-        columns: panels in a row.
-        box: corners of the query points' bounding box, query frame, metres.
-        poses: of the trajectories.
-        share: of a row's height that its panels take; tall contents need more room between rows.
+        views: views with their titles, from the upper left.
+        columns: number of panels in a row.
+        box: corners of the box of query points, (8, 3), metres, query frame.
+        num_poses: number of poses of the trajectories.
+        share: share of the height of a row that its panels take; tall contents need more room between rows.
     """
     rows = -(-len(views) // columns)
     contents = [content(view, box) for _, view in views]
@@ -137,30 +166,29 @@ def panels(
         for index, (title, view) in enumerate(views):
             row, column = divmod(index, columns)
             tall = (1 - foot) / rows
-            axes = figure.add_axes(
-                (
-                    (column + 0.07) / columns,
-                    foot + tall * (rows - 1 - row + (0.93 - share) / 2),
-                    0.83 / columns,
-                    share * tall,
-                ),
-                projection="3d",
-            )
+            bottom = foot + tall * (rows - 1 - row + (0.93 - share) / 2)
+            axes = add_axes3d(figure, ((column + 0.07) / columns, bottom, 0.83 / columns, share * tall))
             draw(axes, view, box)
             frame(axes, contents[index], size)
             axes.set_title(title, y=1.0, fontsize=8)
             legend |= legend_of(axes)
-        waypoint_bar(figure, poses, (0.62, 0.42 / height, 0.3, 0.1 / height))
+        waypoint_bar(figure, num_poses, (0.62, 0.42 / height, 0.3, 0.1 / height))
         figure.legend(legend.values(), legend.keys(), loc="lower left", bbox_to_anchor=(0.01, 0.0), frameon=False)
     return figure
 
 
-def waypoint_bar(figure: Figure, poses: int, place: tuple[float, float, float, float]) -> None:
-    """The colours of the query boxes, in a rectangle of the figure."""
-    axes = figure.add_axes(place)
-    norm = BoundaryNorm(np.arange(poses + 1) - 0.5, poses)
-    colours = ListedColormap(COLOURS(np.linspace(0, 1, poses)))
-    bar = figure.colorbar(ScalarMappable(norm, colours), cax=axes, orientation="horizontal", ticks=[0, poses - 1])
+def waypoint_bar(figure: Figure, num_poses: int, rectangle: tuple[float, float, float, float]) -> None:
+    """Add a colour bar of the query boxes.
+
+    Args:
+        figure: the figure.
+        num_poses: number of poses of the trajectory.
+        rectangle: left, bottom, width and height, shares of the figure.
+    """
+    axes = figure.add_axes(rectangle)
+    norm = BoundaryNorm(np.arange(num_poses + 1) - 0.5, num_poses)
+    colours = ListedColormap(COLOURS(np.linspace(0, 1, num_poses)))
+    bar = figure.colorbar(ScalarMappable(norm, colours), cax=axes, orientation="horizontal", ticks=[0, num_poses - 1])
     bar.set_ticklabels(["pick", "place"])
     bar.set_label("query boxes; the filled face is +x of the query frame", labelpad=1)
     bar.ax.tick_params(length=0)
