@@ -1,12 +1,12 @@
-"""tdf_jax against PyTorch, in one run and in turns.
+"""Time and memory of tdf_jax against PyTorch, in one run and in turns.
 
     python -m bench --out results             # all rows: bench.json and bench.md; about half an hour on two cores
-    python -m bench --only encode_1500 step_10 python -m bench --gate                    # exit code 1 where a check
-    fails or a ratio fell below 0.6 of bench/baseline.json's python -m bench --scaling --out results   # and curves over
-    starts, poses, query points and cloud points, as scaling.png
+    python -m bench --only encode_1500 step_10
+    python -m bench --gate                    # exit code 1 if a check fails or a ratio is far below bench/baseline.json
+    python -m bench --scaling --out results   # also curves over sizes, as scaling.png
 
-It needs an idle machine: PyTorch's threads wait for each other at every operation, and lose far more than their share
-to another process.
+The machine must be idle: PyTorch's threads wait for each other at every operation, so another process slows them down
+by far more than its share.
 """
 
 import argparse
@@ -27,7 +27,7 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
 
 BASELINE = Path(__file__).with_name("baseline.json")
-BUSY_LOAD = 0.5  # processes; at a load of 5 on two cores PyTorch's steps took ten times as long
+BUSY_LOAD = 0.5  # processes; a higher load slows PyTorch down much more than tdf_jax
 QUICK_ENERGIES = {"inits": 2, "poses": 3, "queries": 20}
 
 
@@ -35,10 +35,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and report.
 
     Args:
-        arguments: the command line's words; by default the process's.
+        arguments: words of the command line; by default those of the process.
 
     Returns:
-        0; 1 where a check, a competitor or the gate failed; 2 for a user's mistake.
+        0; 1 if a check, a competitor or the gate fails; 2 for a user's mistake.
     """
     options = _options(arguments)
     try:
@@ -58,15 +58,15 @@ def _options(arguments):
     parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, metavar="DIR", help="write bench.json, bench.md and plots here")
     parser.add_argument(
-        "--only", nargs="+", metavar="NAME", help="these rows, such as encode_1500 step_10 target landscape train"
+        "--only", nargs="+", metavar="NAME", help="rows to measure, such as encode_1500 step_10 target landscape train"
     )
     parser.add_argument(
-        "--repetitions", type=int, default=5, help="of every competitor, after a first call (default: 5)"
+        "--repetitions", type=int, default=5, help="calls of every competitor, after a first one (default: 5)"
     )
-    parser.add_argument("--quick", action="store_true", help="small sizes, to test the machinery")
+    parser.add_argument("--quick", action="store_true", help="use small sizes, to test the benchmark itself")
     parser.add_argument("--gate", action="store_true", help="compare with the baseline")
     parser.add_argument("--baseline", type=Path, default=BASELINE, metavar="FILE", help="default: bench/baseline.json")
-    parser.add_argument("--scaling", action="store_true", help="curves over sizes too; needs --out")
+    parser.add_argument("--scaling", action="store_true", help="measure curves over sizes too; needs --out")
     return parser.parse_args(arguments)
 
 
@@ -103,10 +103,10 @@ def _run(options):
             flush=True,
         )
         record["rows"] = {}
-        for row in selected if correct else ():  # what is wrong is not timed
+        for row in selected if correct else ():  # wrong results are not timed
             record["rows"][row.name] = measure(row, workers, state, options.repetitions)
             print(report.line(row.name, record["rows"][row.name]), flush=True)
-            _write(options.out, record)  # as far as it goes: all of it takes half an hour
+            _write(options.out, record)  # after every row, because all rows take half an hour
         if options.scaling and correct:
             from bench import scaling
 

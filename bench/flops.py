@@ -1,9 +1,9 @@
 """Floating-point operations of each row, counted in one place.
 
-Counted are the multiplications and additions of the matrix products that the task needs in its leanest known form, the
-same for all competitors: what a competitor does beyond that (repeated latents, edge features, weight gradients nobody
-asked for) lowers its rate, as it should. Element-wise work, neighbour search and sums of differences are not counted,
-so 100 % of the matmul peak cannot be reached.
+The count is that of the multiplications and additions of the matrix products in the leanest known form of a task, the
+same for all competitors. Further work of a competitor (repeated latents, edge features, unused weight gradients) lowers
+its rate. Element-wise operations, neighbour search and sums of differences are not counted, so no rate reaches 100 % of
+the matmul peak.
 """
 
 from tdf_jax.networks.occupancy import NetworkConfig

@@ -1,15 +1,19 @@
-"""Comparing a run with the committed baseline: correctness, and ratios within a wide margin."""
+"""Comparison of a run with the committed baseline: correctness, and ratios within a wide margin."""
 
 import json
 from pathlib import Path
 
 from tdf_jax._internal.errors import InputError
 
-LEAST = 0.6  # of the baseline's ratio: two runs of one machine differed by a quarter under load
+LEAST = 0.6  # smallest ratio, as a share of the baseline's; runs of one machine differ under load
 
 
 def failed_checks(record: dict) -> list[str]:
-    """Every correctness check that failed and every competitor that did, in words."""
+    """All checks and competitors that failed, in words.
+
+    Args:
+        record: record of the run.
+    """
     named = [("parity", one) for one in record["parity"]]
     named += [(name, one) for name, row in record["rows"].items() for one in row["checks"]]
     failures = [
@@ -26,9 +30,13 @@ def failed_checks(record: dict) -> list[str]:
 
 
 def lost_ratios(record: dict, baseline: dict) -> tuple[list[str], list[str]]:
-    """Ratios below `LEAST` of the baseline's or missing, and rows that could not be compared, in words.
+    """Ratios that are missing or below `LEAST` of the baseline's, and rows that could not be compared, in words.
 
-    Rows are compared where both runs have them at the same sizes.
+    Rows are compared if both runs have them at the same sizes.
+
+    Args:
+        record: record of the run.
+        baseline: record of the baseline.
     """
     lost, apart = [], []
     for name, row in record["rows"].items():
@@ -42,16 +50,20 @@ def lost_ratios(record: dict, baseline: dict) -> tuple[list[str], list[str]]:
                 lost.append(f"{name}: no ratio {pair}; the baseline's is {expected:.2f}")
             elif found < LEAST * expected:
                 lost.append(
-                    f"{name}: {pair} is {found:.2f}, {found / expected:.2f} of the baseline's {expected:.2f}; expected {LEAST} of it"
+                    f"{name}: {pair} is {found:.2f}, {found / expected:.2f} of the baseline's {expected:.2f}; expected "
+                    f"{LEAST} of it"
                 )
     return lost, apart
 
 
 def read(path: str | Path) -> dict:
-    """A record.
+    """Read a record.
+
+    Args:
+        path: the file.
 
     Raises:
-        InputError: the file is missing or is none.
+        InputError: the file is missing or is no record.
     """
     try:
         record = json.loads(Path(path).read_text())

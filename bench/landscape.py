@@ -1,15 +1,14 @@
-"""Energy landscapes: a lattice's shared sweep against one evaluation for each (grid point, query point), in one run, alternating.
+"""Time of energy landscapes: the shared sweep of a lattice against an evaluation for each grid point and query point.
 
-    python -m bench.landscape              # the plane: 101 x 101 points 12 mm apart, 6 x 6 x 7 query points, 7
-    waypoints python -m bench.landscape --volume     # and the volume: 64^3 points over +-0.3 m, shared only
+Both sweeps take turns in one run. They share each evaluation between waypoints and use the same sums. Compilation is
+measured separately.
 
-Both sweeps share each evaluation between waypoints and use the same sums; compilation is apart.
+    python -m bench.landscape              # a plane
+    python -m bench.landscape --volume     # and a volume, shared only
 """
 
 import argparse
 import json
-import os
-import platform
 import resource
 import statistics
 import time
@@ -18,7 +17,8 @@ import jax
 import numpy as np
 
 import tdf_jax as tdf
-from tdf_jax.evaluation.cases import mug_of
+from bench import scene
+from bench.machine import machine
 from tdf_jax.landscape import shared_lattice
 
 HALF, COUNT, PITCH, LATTICE, POSES = 0.6, 101, 0.012, (6, 6, 7), 7
@@ -26,37 +26,40 @@ VOLUME_HALF, VOLUME_COUNT = 0.3, 64
 
 
 def case(pitch: float):
-    """A field and a reference: a wave from one generated mug's handle, on another mug."""
+    """The field of a generated mug, and the reference of a wave from the handle of another.
+
+    Args:
+        pitch: distance of neighbouring query points, metres.
+    """
     model = tdf.load_model("mug")
-    shown, new = (mug_of(0, which, 0.12) for which in (0, 1))
-    start = shown.handle_frame[:3, 3]
+    start = scene.handle()
     path = tdf.wave(POSES, start=start, end=start + [0.0, 0.3, 0.0])
     query = tdf.lattice_query(LATTICE, pitch)
-    demonstration = tdf.Demonstration(tdf.sample_surface(shown.mesh, 1500, 0).astype(np.float32), path, query)
-    field = tdf.encode(model, tdf.sample_surface(new.mesh, 1500, 1).astype(np.float32))
+    demonstration = tdf.Demonstration(scene.surface(0, 1500), path, query)
+    field = tdf.encode(model, scene.surface(1, 1500))
     return field, tdf.describe(model, demonstration), start
 
 
 def timed(field, reference, grid, share):
-    """Seconds of a sweep, and its energies."""
+    """Seconds of a sweep, and its energies.
+
+    Args:
+        field: the field.
+        reference: the reference.
+        grid: the grid.
+        share: whether the sweep shares evaluations between grid points.
+    """
     began = time.perf_counter()
     values = tdf.energy_landscape(field, reference, grid, share=share).values
     return time.perf_counter() - began, values
 
 
-def machine() -> dict:
-    """What it ran on, and how busy that was."""
-    return {
-        "cpu": platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-        "load": round(os.getloadavg()[0], 2),
-        "jax": jax.__version__,
-        "device": jax.devices()[0].device_kind,
-    }
-
-
 def plane(repetitions: int) -> dict:
-    """The shared sweep and the direct one of the plane."""
+    """The shared and the direct sweep of the plane.
+
+    Args:
+        repetitions: number of sweeps of each kind, after a first one that compiles.
+    """
     field, reference, start = case(PITCH)
     grid = tdf.plane_grid(HALF, COUNT, start)
     counts = {
@@ -109,13 +112,13 @@ def volume() -> dict:
 
 
 def main() -> None:
-    """Measure and print; JSON with --json."""
+    """Measure and print the times, as JSON with --json."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--repetitions", type=int, default=3)
-    parser.add_argument("--volume", action="store_true", help="the volume too")
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--repetitions", type=int, default=3, help="sweeps of each kind (default: 3)")
+    parser.add_argument("--volume", action="store_true", help="measure the volume too")
+    parser.add_argument("--json", action="store_true", help="print the record as JSON")
     options = parser.parse_args()
-    record = {"machine": machine(), "plane": plane(options.repetitions)}
+    record = {"machine": machine() | {"device": jax.devices()[0].device_kind}, "plane": plane(options.repetitions)}
     if options.volume:
         record["volume"] = volume()
     if options.json:
@@ -126,7 +129,8 @@ def main() -> None:
     for name in ("shared", "direct"):
         spread = ", ".join(f"{seconds:.2f}" for seconds in found["seconds"][name])
         print(
-            f"plane, {name}: {found['evaluations'][name]:,} evaluations, {spread} s (first call {found['seconds']['first'][name]:.2f})"
+            f"plane, {name}: {found['evaluations'][name]:,} evaluations, {spread} s (first call "
+            f"{found['seconds']['first'][name]:.2f})"
         )
     print(
         f"plane: {found['evaluations_ratio']:.1f} x fewer evaluations, {found['time_ratio']:.1f} x less time, "
@@ -135,8 +139,9 @@ def main() -> None:
     if options.volume:
         found = record["volume"]
         print(
-            f"volume: {found['evaluations']:,} evaluations (one by one {found['one_by_one']:,}), {found['seconds_with_compilation']:.1f} s with "
-            f"compilation, peak {found['peak_megabytes']:.0f} MB ({found['peak_megabytes_before']:.0f} before)"
+            f"volume: {found['evaluations']:,} evaluations (one by one {found['one_by_one']:,}), "
+            f"{found['seconds_with_compilation']:.1f} s with compilation, peak {found['peak_megabytes']:.0f} MB "
+            f"({found['peak_megabytes_before']:.0f} before)"
         )
 
 

@@ -1,4 +1,4 @@
-"""What a measurement ran on: processor, versions, load, and a process's memory."""
+"""The machine of a measurement: processor, versions, load, and the memory of a process."""
 
 import contextlib
 import ctypes
@@ -29,25 +29,24 @@ def cores() -> int:
 
 
 def available() -> float:
-    """Bytes that can be taken without swapping; infinite where the system does not say."""
+    """Available memory without swapping, bytes; infinite if the system does not report it."""
     return _field("/proc/meminfo", "MemAvailable") or float("inf")
 
 
 def resident() -> float:
-    """Bytes of this process that lie in memory."""
+    """Resident memory of this process, bytes."""
     return _field("/proc/self/status", "VmRSS")
 
 
 def peak() -> float:
-    """The most they were since `settle`, or since the start where that could not be reset."""
+    """Peak of the resident memory since `settle`, bytes; since the start if the system cannot reset it."""
     return _field("/proc/self/status", "VmHWM")
 
 
 def settle() -> None:
     """Return freed memory to the system and begin a new peak.
 
-    A child of glibc that keeps all it ever had (the tuned PyTorch) would otherwise show the largest row before this
-    one.
+    The tuned PyTorch keeps all memory that it ever had, so it would otherwise show the peak of an earlier row.
     """
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
@@ -56,7 +55,7 @@ def settle() -> None:
 
 
 def busy() -> float:
-    """Seconds that all processors together have worked since the system started."""
+    """Busy seconds of all processors together since the system started."""
     with contextlib.suppress(OSError):
         user, nice, system, _, _, interrupts, soft = map(int, Path("/proc/stat").read_text().split()[1:8])
         return (user + nice + system + interrupts + soft) / os.sysconf("SC_CLK_TCK")

@@ -1,4 +1,4 @@
-"""Measuring one row: prepare every competitor, check that they agree, then repeat in turns."""
+"""Measurement of one row: prepare every competitor, check that they agree, then repeat in turns."""
 
 import dataclasses
 import statistics
@@ -16,15 +16,15 @@ MATRIX = 2048  # rows of the square matrices that the matmul peak is measured wi
 
 
 class Plan(NamedTuple):
-    """What one competitor does in a row.
+    """The task of one competitor in a row.
 
     Attributes:
-        task: of its module.
-        settings: of the task.
-        inits: starts it is given, where not all of them fit into memory.
-        once: measured by its only call, without one to warm up.
-        scale: its time counts this many times, for it does only a part of the row's work.
-        note: said in the report.
+        task: name of the task in the competitor's module.
+        settings: settings of the task.
+        inits: number of starts, if not all of them fit into memory.
+        once: whether its only call is measured, without a first call that warms up.
+        scale: factor of its time, if it does only a part of the work of the row.
+        note: note in the report.
     """
 
     task: str
@@ -158,7 +158,12 @@ def matmul_gflops(workers: Workers, state: dict, repetitions: int = 8) -> dict[s
 
 
 def ratios(competitors: dict[str, dict], of: str = "median") -> dict[str, float]:
-    """Every peer's median or least time over each of ours, such as "torch / tdf_jax"; least times suffer less from other processes."""
+    """Ratios of the times of every peer and each of ours, by names such as "torch / tdf_jax".
+
+    Args:
+        competitors: results by competitor.
+        of: "median", or "least", which depends less on other processes.
+    """
     return {
         f"{peer} / {our}": competitors[peer]["seconds"][of] / competitors[our]["seconds"][of]
         for our in OURS

@@ -176,5 +176,5 @@ def _problem(model, arrays):
     demonstration = tdf.Demonstration(
         jnp.asarray(arrays["shown"]), tdf.Trajectory(jnp.asarray(arrays["path"])), jnp.asarray(arrays["query"])
     )
-    energy = tdf.EnergyWeights(correlation=float(arrays["correlation"]), rotation_scale=float(arrays["lever"]))
+    energy = tdf.EnergyWeights(correlation=float(arrays["correlation"]), rotation_scale=float(arrays["rotation_scale"]))
     return tdf.encode(model, jnp.asarray(arrays["new"])), tdf.describe(model, demonstration), energy

@@ -1,4 +1,4 @@
-"""What must hold before anything is timed: the peer is the original network, and both sides have the same energies and gradients."""
+"""Checks before any timing: the peer is the original network, and both sides have equal energies and gradients."""
 
 from pathlib import Path
 
@@ -11,8 +11,8 @@ from bench.workers import Workers
 from tdf_jax._internal.errors import InputError
 
 GOLDEN = Path(__file__).resolve().parents[1] / "tests" / "fixtures" / "ndf_latent32"
-ORIGINAL = {"float32": 5e-5, "float64": 1e-10}  # found: up to 1.8e-5 and 2e-14
-ENERGIES, GRADIENTS = 1e-5, 1e-3  # an absolute difference's derivative is a sign, and rounding turns some of them
+ORIGINAL = {"float32": 5e-5, "float64": 1e-10}
+ENERGIES, GRADIENTS = 1e-5, 1e-3  # gradients contain signs of differences, and rounding changes some of them
 
 
 def parity(workers: Workers, inits: int = 3, poses: int = 7, queries: int = 100) -> list[dict]:
@@ -20,7 +20,9 @@ def parity(workers: Workers, inits: int = 3, poses: int = 7, queries: int = 100)
 
     Args:
         workers: the competitors' processes.
-        inits, poses, queries: sizes of the energies that are compared.
+        inits: number of starts of the energies that are compared.
+        poses: number of poses.
+        queries: number of query points.
 
     Raises:
         InputError: the golden outputs are not there.

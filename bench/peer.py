@@ -118,7 +118,7 @@ def descent(network, tuned, settings, arrays):
 
 
 def landscape(network, tuned, settings, arrays):
-    """Energies (waypoints, rotations, *grid) of a query set in several orientations; descriptors are shared between waypoints."""
+    """Energies of query points in several orientations, (waypoints, rotations, *grid); waypoints share descriptors."""
     problem, _, _ = _problem(network, arrays)
     latent, grid = problem.latents[:1], arrays["grid"].reshape(-1, 3)
 
@@ -176,8 +176,8 @@ def _problem(network: OccupancyNetwork, arrays):
         descriptors = torch.cat([network.descriptors(one[None], latents[:1]) for one in x])
         R0, t0 = _matrices(arrays["starts"])
     repeated = latents[1:].repeat(len(R0), 1, 1)
-    k, lever = (float(arrays[name]) for name in ("correlation", "lever"))
-    problem = Problem(repeated, new.mean(0), query, descriptors, R, t - shown.mean(0), k, lever)
+    k, rotation_scale = (float(arrays[name]) for name in ("correlation", "rotation_scale"))
+    problem = Problem(repeated, new.mean(0), query, descriptors, R, t - shown.mean(0), k, rotation_scale)
     return problem, R0, R0 @ query.mean(0) + t0
 
 

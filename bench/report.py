@@ -1,19 +1,29 @@
-"""A run as Markdown: times and ratios, rates and memory, the targets, the checks."""
+"""The report of a run as Markdown: times and ratios, rates and memory, targets, and checks."""
 
 from bench.gate import failed_checks
 from bench.workers import COMPETITORS
+from tdf_jax.evaluation.tables import markdown as table
 
-BUSY = 0.1  # cores: more work by others than this is said beside the row
+BUSY = 0.1  # cores; the report notes more work than this by other processes
 
 
 def markdown(record: dict) -> str:
-    """The whole report of one run."""
+    """The report of one run.
+
+    Args:
+        record: the record, as `bench.__main__` writes it.
+    """
     parts = [_heading(record), _times(record), _rates(record), _targets(record), _checks(record)]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def line(name: str, row: dict) -> str:
-    """One row in one line, for the terminal."""
+    """One row in one line, for the terminal.
+
+    Args:
+        name: name of the row.
+        row: its entry in the record.
+    """
     times = ", ".join(f"{competitor} {_seconds(found)}" for competitor, found in row["competitors"].items())
     ratios = ", ".join(f"{pair} {ratio:.2f}" for pair, ratio in row["ratios"].items())
     return f"{name}: {times}" + (f"; {ratios}" if ratios else "")
@@ -25,13 +35,14 @@ def _heading(record):
     peaks = ", ".join(f"{rate:.0f} in {COMPETITORS[name].title}" for name, rate in record["matmul_gflops"].items())
     words = [
         "# tdf_jax against PyTorch",
-        f"{machine['cpu']}, {machine['cores']} cores, {machine['memory_gigabytes']} GB, {machine['system']}; load {machine['load']} at the start. "
-        f"{versions}. Float32 matmul peak, GFLOP/s: {peaks}.",
-        "All competitors have the same weights and inputs and take turns in one run, each in a process of its own. Times are medians (least to "
-        "most) after a first call that warms up; ratios are of medians (and of least times). (a) PyTorch as NDF's users run it: weights record "
-        "gradients, the standard allocator. (b) tuned by an expert: no gradients for weights that nobody trains, one thread a core, glibc told to "
-        "keep its memory, a fixed pose evaluated once. (c) tdf_jax on the same processors. All encode before the first step, as NDF does; times "
-        "to a target begin after that.",
+        f"{machine['cpu']}, {machine['cores']} cores, {machine['memory_gigabytes']} GB, {machine['system']}; "
+        f"load {machine['load']} at the start. {versions}. Float32 matmul peak, GFLOP/s: {peaks}.",
+        "All competitors have the same weights and inputs and take turns in one run, each in a process of its own. "
+        "Times are medians (least to most) after a first call that warms up; ratios are of medians (and of least "
+        "times). (a) PyTorch as NDF's users run it: weights record gradients, and the standard allocator is used. "
+        "(b) PyTorch tuned by an expert: no gradients for weights that are not trained, one thread for each core, a "
+        "setting of glibc that keeps freed memory, and a fixed pose that is evaluated once. (c) tdf_jax on the same "
+        "processors. All encode before the first step, as NDF does; times to a target begin after that.",
     ]
     if record["quick"]:
         words.insert(1, "**Quick run: sizes that test the machinery; the times mean nothing.**")
@@ -43,8 +54,7 @@ def _times(record):
     names = [name for name in COMPETITORS if any(name in row["competitors"] for row in record["rows"].values())]
     heads = (f"{COMPETITORS[name].mark} {COMPETITORS[name].title}" for name in names)
     ratios = (" / ".join(COMPETITORS[name].mark for name in pair.split(" / ")) for pair in pairs)
-    lines = [_cells("seconds", *heads, *ratios), _rule(1 + len(names) + len(pairs))]
-    notes = []
+    rows, notes = [], []
     for row in record["rows"].values():
         cells, others = [], max((found["others_cores"] for found in row["competitors"].values()), default=0.0)
         for name in names:
@@ -54,26 +64,18 @@ def _times(record):
                 notes.append(f"- {row['title']}, {COMPETITORS[name].mark}: {found['note']}.")
         if others > BUSY and not record["quick"]:
             notes.append(
-                f"- {row['title']}: other processes used up to {others:.1f} cores meanwhile; measure again on an idle machine."
+                f"- {row['title']}: other processes used up to {others:.1f} cores meanwhile; measure again on an idle "
+                "machine."
             )
-        lines.append(_cells(row["title"], *cells, *(_ratio(row, pair) for pair in pairs)))
-    return "## Times\n\n" + "\n".join(lines) + ("\n\n" + "\n".join(notes) if notes else "")
+        rows.append([row["title"], *cells, *(_ratio(row, pair) for pair in pairs)])
+    parts = ["## Times", table(["seconds", *heads, *ratios], rows), "\n".join(notes)]
+    return "\n\n".join(part for part in parts if part)
 
 
 def _rates(record):
     best = max(record["matmul_gflops"].values())
-    lines = [
-        _cells(
-            "row",
-            "competitor",
-            "GFLOP/s",
-            "of the matmul peak",
-            "peak memory, MB",
-            "before the row, MB",
-            "compiling, s",
-        ),
-        _rule(7),
-    ]
+    heads = ["row", "competitor", "GFLOP/s", "of the matmul peak", "peak memory, MB", "before the row, MB"]
+    rows = []
     for row in record["rows"].values():
         for name, found in row["competitors"].items():
             compiling = "" if found["compile_seconds"] is None else f"{found['compile_seconds']:.1f}"
@@ -83,12 +85,13 @@ def _rates(record):
                 else (f"{found['gflops']:.1f}", f"{100 * found['gflops'] / best:.0f} %")
             )
             memory = f"{found['peak_megabytes']:.0f}", f"{found['base_megabytes']:.0f}"
-            lines.append(_cells(row["title"], COMPETITORS[name].mark, *rate, *memory, compiling))
+            rows.append([row["title"], COMPETITORS[name].mark, *rate, *memory, compiling])
     words = (
-        "Operations are those of the leanest known form of the task, the same for all (bench/flops.py); where an answer takes fewer, a rate may "
-        "pass the peak. Memory is the process's resident set, its libraries and inputs included."
+        "Operations are those of the leanest known form of the task, the same for all (bench/flops.py); an answer that "
+        "takes fewer may have a rate above the peak. Memory is the resident set of the process, its libraries and "
+        "inputs included."
     )
-    return "## Rates and memory\n\n" + words + "\n\n" + "\n".join(lines)
+    return "\n\n".join(["## Rates and memory", words, table([*heads, "compiling, s"], rows)])
 
 
 def _targets(record):
@@ -105,7 +108,8 @@ def _targets(record):
         below = facts.get("tdf_jax_steps")
         passed = "" if below is None else f"; (c)'s steps passed the target after {below}"
         lines.append(
-            f"- {row['title']}: target {facts['target']:.6f}, the best of PyTorch's starts; reached: {reached or 'nothing'}{passed}."
+            f"- {row['title']}: target {facts['target']:.6f}, the best of PyTorch's starts; reached: "
+            f"{reached or 'nothing'}{passed}."
         )
     return "## Targets\n\n" + "\n".join(lines) if lines else ""
 
@@ -115,9 +119,9 @@ def _checks(record):
     everything += [(row["title"], one) for row in record["rows"].values() for one in row["checks"]]
     failures = failed_checks(record)
     words = f"{sum(one['passed'] for _, one in everything)} of {len(everything)} checks passed."
-    lines = [_cells("row", "check", "error", "tolerance"), _rule(4)]
-    lines += [_cells(title, one["what"], f"{one['error']:.1e}", f"{one['tolerance']:.0e}") for title, one in everything]
-    return "\n\n".join(["## Correctness", words, *(f"- **{failure}**" for failure in failures), "\n".join(lines)])
+    rows = [[title, one["what"], f"{one['error']:.1e}", f"{one['tolerance']:.0e}"] for title, one in everything]
+    checks = table(["row", "check", "error", "tolerance"], rows)
+    return "\n\n".join(["## Correctness", words, *(f"- **{failure}**" for failure in failures), checks])
 
 
 def _seconds(found):
@@ -129,11 +133,3 @@ def _seconds(found):
 
 def _ratio(row, pair):
     return f"{row['ratios'][pair]:.2f} ({row['ratios_of_least'][pair]:.2f})" if pair in row["ratios"] else ""
-
-
-def _cells(*words):
-    return "| " + " | ".join(words) + " |"
-
-
-def _rule(columns):
-    return "|" + "---|" * columns

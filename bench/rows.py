@@ -1,4 +1,4 @@
-"""The rows: what is measured, at which sizes, and what must agree."""
+"""The rows of the benchmark: tasks, their sizes, and the results that must agree."""
 
 import dataclasses
 import importlib.util
@@ -15,7 +15,7 @@ NDF_RATES = {"rotation_rate": 0.01, "translation_rate": 0.01, "final_rate": 1.0}
 # of one query point's graph; measured 87 and 104 kB, tuned heaps have holes
 POINT_BYTES = {"torch": 95e3, "torch_tuned": 120e3}
 MEMORY_SHARE = 0.8  # of the available memory
-LATENTS, LOSSES, VALUES = 1e-4, 1e-3, 1e-4  # Adam's first steps follow signs, which rounding turns
+LATENTS, LOSSES, VALUES = 1e-4, 1e-3, 1e-4  # Adam's first steps depend on signs, which rounding changes
 PROBED = 3  # steps from which the 100 of PyTorch as users run it are estimated: all of them would take minutes
 
 
@@ -123,8 +123,8 @@ def step(inits: int, poses: int, queries: int) -> Row:
     sizes = {"inits": inits, "poses": poses, "queries": queries}
     work = flops.decoder_gradient(inits * poses * queries)
     return Row(
-        f"step_{inits}", title, sizes, lambda: scene.imitation(inits, poses, queries), plans, agree({"losses": LOSSES}), work,
-        most=3 if inits > 10 else 100,
+        f"step_{inits}", title, sizes, lambda: scene.imitation(inits, poses, queries), plans,
+        agree({"losses": LOSSES}), work, most=3 if inits > 10 else 100,
     )  # fmt: skip
 
 
@@ -210,7 +210,8 @@ def sweeping(sizes: Sizes) -> Row:
         return checks, facts | {"evaluations": {"one by one": direct, "tdf_jax": shared}}
 
     about = {"points": sizes.grid**2, "rotations": sizes.rotations, "queries": len(query), "poses": sizes.poses}
-    title = f"landscape, {about['points']} points x {about['rotations']} rotations x {about['queries']} queries x {about['poses']} waypoints"
+    title = f"landscape, {about['points']} points x {about['rotations']} rotations x {about['queries']} queries x "
+    title += f"{about['poses']} waypoints"
     return Row("landscape", title, about, arrays, plans, values, work)
 
 

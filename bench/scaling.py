@@ -1,4 +1,4 @@
-"""How time and memory grow with starts, poses, query points and cloud points."""
+"""Growth of time and memory with the numbers of starts, poses, query points and cloud points."""
 
 from pathlib import Path
 
@@ -47,7 +47,11 @@ def scaling(workers: Workers, state: dict, quick: bool, repetitions: int, progre
 
 
 def figure(curves: dict) -> Figure:
-    """Time above, memory below, one column for each axis; both logarithmic, so a straight line of slope one is proportional growth."""
+    """Time above and memory below, one column for each axis, on logarithmic scales.
+
+    Args:
+        curves: the curves, as `scaling` returns them.
+    """
     drawn = Figure(figsize=(3.4 * len(curves), 6.0), layout="constrained")
     FigureCanvasAgg(drawn)
     axes = drawn.subplots(2, len(curves), squeeze=False)

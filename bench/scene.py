@@ -1,4 +1,4 @@
-"""What every competitor is given: the shipped weights under the checkpoints' names, and one imitation's clouds, poses and query points."""
+"""Inputs of all competitors: the shipped weights, and the clouds, poses and query points of one imitation."""
 
 import functools
 
@@ -13,41 +13,59 @@ import tdf_jax as tdf
 from tdf_jax.evaluation.cases import mug_of
 
 HEIGHT = 0.12  # metres
-NEAR = 0.01  # metres from the surface: "inside", for training's labels; only the time of the loss counts
+NEAR = 0.01  # metres from the surface; closer points count as inside, because only the time of the loss matters
 
 
 def weights(model: tdf.Model) -> dict[str, np.ndarray]:
-    """A model's tensors as a PyTorch state_dict has them: (out, in)."""
+    """Tensors of a model by the names and with the layout of a PyTorch state_dict, (out, in)."""
     tensors = flatten_dict(model.params, sep=".")
     return {name.replace(".kernel", ".weight"): np.asarray(tensor).T for name, tensor in tensors.items()}
 
 
 @functools.cache
-def _surface(index, count):
+def surface(index: int, count: int) -> Float[np.ndarray, "points 3"]:
+    """Points on the surface of a generated mug, metres, its canonical frame.
+
+    Args:
+        index: number of the mug; it is the seed of the points too.
+        count: number of points.
+    """
     return tdf.sample_surface(mug_of(0, index, HEIGHT).mesh, count, index).astype(np.float32)
 
 
+def handle() -> Float[np.ndarray, "3"]:
+    """The handle of the first generated mug, metres, its canonical frame."""
+    return mug_of(0, 0, HEIGHT).handle_frame[:3, 3]
+
+
 def cloud(points: int) -> Float[np.ndarray, "points 3"]:
-    """A generated mug's surface, centred, metres."""
-    surface = _surface(1, points)
-    return surface - surface.mean(axis=0)
+    """A centred cloud of a generated mug, metres."""
+    sampled = surface(1, points)
+    return sampled - sampled.mean(axis=0)
 
 
 def imitation(inits: int, poses: int, queries: int, seed: int = 0) -> dict[str, np.ndarray]:
-    """A wave shown at one mug's handle, and random starts at another mug.
+    """A wave demonstrated at the handle of one mug, and random starts at another mug.
 
-    Clouds are of the weights' density, so that one encoding, the same in all competitors, is enough.
+    Clouds have the density of the weights' training clouds, so that a single encoding, the same in all competitors, is
+    enough.
+
+    Args:
+        inits: number of starts.
+        poses: number of poses of the trajectory.
+        queries: number of query points.
+        seed: seed of the query points, the new mug's rotation and the starts.
 
     Returns:
-        shown, new: clouds (256, 3); path: the demonstration (poses, 7); query: (queries, 3); goal: (7,); starts (inits,
-        poses, 7), the demonstration turned about the object as a whole by a uniform rotation, ending at the goal.
-        Metres, `wxyz_xyz`, world frame.
+        "shown" and "new": clouds, (256, 3); "path": the demonstration, (poses, 7); "query": (queries, 3); "goal": (7,);
+        "starts": (inits, poses, 7), the whole demonstration rotated about the object by uniform rotations, with the
+        goal as the last pose. Metres, `wxyz_xyz`, world frame.
     """
-    shown, new = (tdf.thin(_surface(index, 1500), 256) for index in (0, 1))
+    shown, new = (tdf.thin(surface(index, 1500), 256) for index in (0, 1))
     turn = Rotation.random(random_state=seed)
     new = (turn.apply(new) + (0.1, -0.05, 0.02)).astype(np.float32)
-    handle = mug_of(0, 0, HEIGHT).handle_frame[:3, 3]
-    path = np.asarray(tdf.wave(poses, start=handle, end=handle + [0.0, 0.3, 0.1]).wxyz_xyz, np.float64)
+    start = handle()
+    path = np.asarray(tdf.wave(poses, start=start, end=start + [0.0, 0.3, 0.1]).wxyz_xyz, np.float64)
     origins = shown.mean(axis=0, dtype=np.float64), new.mean(axis=0, dtype=np.float64)
     goal = path[-1] + [0, 0, 0, 0, *(origins[1] - origins[0])]
     starts = []
@@ -58,12 +76,21 @@ def imitation(inits: int, poses: int, queries: int, seed: int = 0) -> dict[str, 
     query = tdf.box_query(jax.random.key(seed), count=queries, size=0.08)
     arrays = {"shown": shown, "new": new, "path": path, "query": query, "goal": goal, "starts": np.stack(starts)}
     weights = tdf.EnergyWeights()
-    arrays |= {"correlation": weights.correlation, "lever": weights.lever}
+    arrays |= {"correlation": weights.correlation, "rotation_scale": weights.rotation_scale}
     return {name: np.asarray(array, np.float32) for name, array in arrays.items()}
 
 
 def batch(clouds: int, points: int, queries: int) -> dict[str, np.ndarray]:
-    """A training batch: clouds (clouds, points, 3), queries (clouds, queries, 3) and labels (clouds, queries)."""
+    """A training batch.
+
+    Args:
+        clouds: number of clouds.
+        points: number of points of each cloud.
+        queries: number of query points of each cloud.
+
+    Returns:
+        "clouds": (clouds, points, 3); "queries": (clouds, queries, 3); "inside": labels, (clouds, queries).
+    """
     rng = np.random.default_rng(0)
     centred = np.stack(
         [tdf.thin(cloud(1500) @ Rotation.random(random_state=i).as_matrix().T, points) for i in range(clouds)]
@@ -78,17 +105,29 @@ def batch(clouds: int, points: int, queries: int) -> dict[str, np.ndarray]:
 
 
 def plane(count: int, pitch: float, points: Float[np.ndarray, "points 3"]) -> tdf.Grid:
-    """A square of the horizontal plane through a cloud's mean."""
+    """A square of the horizontal plane through the centroid of a cloud.
+
+    Args:
+        count: number of grid points along a side.
+        pitch: distance of neighbouring grid points, metres.
+        points: the cloud, (points, 3), metres.
+    """
     return tdf.plane_grid(pitch * (count - 1) / 2, count, points.mean(axis=0, dtype=np.float64))
 
 
 def sweep(count: int, rotations: int, poses: int, lattice: tuple[int, int, int], pitch: float) -> dict[str, np.ndarray]:
-    """An imitation whose query is a lattice, the plane grid about the handle, and turns about the vertical.
+    """An imitation whose query points are a lattice, a plane grid, and rotations about the vertical.
+
+    Args:
+        count: number of grid points along a side.
+        rotations: number of rotations.
+        poses: number of poses of the trajectory.
+        lattice: numbers of query points along the axes.
+        pitch: distance of neighbouring grid and query points, metres.
 
     Returns:
-        As `imitation`, and grid: world points (count, count, 3); rotations: (rotations, 3, 3). With an even number of
-        turns half a turn apart, one or two put the lattice's axes along the grid's, where it can be shared; the others
-        do not.
+        As `imitation`, and "grid": world points, (count, count, 3); "rotations": (rotations, 3, 3). One or two of the
+        rotations put the axes of the lattice along those of the grid, where evaluations can be shared.
     """
     arrays = imitation(1, poses, 1)
     grid = plane(count, pitch, arrays["new"])

@@ -23,7 +23,7 @@ CPU = {"JAX_PLATFORMS": "cpu"}  # where PyTorch runs
 
 
 class Competitor(NamedTuple):
-    """Who is measured: a mark for the tables, a module with `prepare`, whether it is tuned, and what its environment adds."""
+    """A competitor: its mark in tables, its title, its module, whether it is tuned, and environment variables."""
 
     mark: str
     title: str

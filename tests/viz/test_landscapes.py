@@ -116,7 +116,7 @@ def test_a_map_of_many_waypoints_shows_some():
         dataclasses.replace(landscape, **many, waypoints=np.repeat(WAYPOINTS, 50, axis=0)), terrain.Marks(POINTS)
     )
     titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
-    assert len(titles) == 1 + terrain.PANELS
+    assert len(titles) == 1 + terrain.MAX_PANELS
     assert titles[1] == "waypoint 0" and titles[-1] == "waypoint 99"
 
 
@@ -129,7 +129,7 @@ def test_what_cannot_be_shown_is_refused(tmp_path, marks, monkeypatch):
     with pytest.raises(InputError, match="2 axes; expected 3"):
         terrain.save_slices(tmp_path / "it.gif", plane, marks)
     each = dataclasses.replace(plane, values=plane.values[:, None], turned=None)
-    with pytest.raises(InputError, match="each rotation"):
+    with pytest.raises(InputError, match="every rotation"):
         terrain.map_figure(each, marks)
     monkeypatch.setitem(__import__("sys").modules, "plotly.graph_objects", None)
     with pytest.raises(InputError, match="pip install"):

@@ -105,13 +105,13 @@ def test_reconstructions_stand_below_the_true_surfaces(panels, coarse):
 
 def test_boxes_are_drawn_at_the_true_and_the_found_place(panels, coarse, monkeypatch):
     drawn = []
-    box = reconstruction.solid.box
+    box = reconstruction.polygons3d.box
 
     def watching(corners, colour, **how):
         drawn.append((corners, how))
         return box(corners, colour, **how)
 
-    monkeypatch.setattr(reconstruction.solid, "box", watching)
+    monkeypatch.setattr(reconstruction.polygons3d, "box", watching)
     figure = transfer_figure(panels)
     assert len(panels_of(figure)) == 6 and len(drawn) == 12
     np.testing.assert_allclose([drawn[0][0].min(axis=0), drawn[0][0].max(axis=0)], [[2, -3, -3], [8, 3, 3]])
