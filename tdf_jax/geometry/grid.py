@@ -117,7 +117,7 @@ def plane_grid(
         InputError: half is not above 0, count is below 2, the origin is not a finite point, or axes is unknown.
     """
     steps = _symmetric_steps("plane_grid()", half, count)
-    centre = checks.vector("plane_grid()", "origin", origin)
+    centre = np.asarray(checks.vector("plane_grid()", "origin", origin))
     if isinstance(axes, str):
         if axes not in PLANES:
             raise InputError(
@@ -151,7 +151,7 @@ def volume_grid(
             perpendicular unit vectors.
     """
     steps = _symmetric_steps("volume_grid()", half, count)
-    centre = checks.vector("volume_grid()", "origin", origin)
+    centre = np.asarray(checks.vector("volume_grid()", "origin", origin))
     return Grid(centre, np.eye(3) if axes is None else np.asarray(axes), (steps, steps, steps))
 
 

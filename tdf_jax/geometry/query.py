@@ -1,4 +1,4 @@
-"""Query points: points where descriptors are evaluated, fixed in the query frame (of the gripper or the placing region).
+"""Query points: points where descriptors are evaluated, fixed in the frame of the gripper or the placing region.
 
 All functions return points (queries, 3), metres, query frame.
 """
@@ -18,7 +18,7 @@ from tdf_jax._internal.errors import InputError
 def box_query(
     key: PRNGKeyArray,
     count: int = 500,
-    size: float | ArrayLike = 0.08,
+    size: float | Sequence[float] = 0.08,
     centre: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Float[Array, "queries 3"]:
     """Sample query points uniformly in a box whose edges are along the axes of the query frame.

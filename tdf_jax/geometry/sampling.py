@@ -56,8 +56,8 @@ def subsamples(points: Float[np.ndarray, "points 3"], count: int, times: int) ->
 def farthest_point_indices(points: Float[np.ndarray, "points 3"], count: int) -> Int[np.ndarray, " subset"]:
     """Choose points of a cloud by farthest-point sampling: each is the farthest from those before it.
 
-    The first point is the farthest from the mean; of equally far points the one of lowest index is chosen. The choice is
-    deterministic, and no point is chosen twice.
+    The first point is the farthest from the mean; of equally far points the one of lowest index is chosen. The choice
+    is deterministic, and no point is chosen twice.
 
     Args:
         points: point cloud, (points, 3), metres.

@@ -89,8 +89,8 @@ def matrix_from_wxyz(wxyz: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
 def wxyz_from_matrix(R: Float[Array, "... 3 3"]) -> Float[Array, "... 4"]:
     """Compute the unit quaternion of a rotation matrix, with w >= 0.
 
-    The entries of 4 q q^T are linear in R. The row with the largest diagonal entry is a multiple of q whose length is at
-    least 2, so normalising that row is accurate for every rotation and needs no square root near zero.
+    The entries of 4 q q^T are linear in R. The row with the largest diagonal entry is a multiple of q whose length is
+    at least 2, so normalising that row is accurate for every rotation and needs no square root near zero.
 
     Args:
         R: rotation matrices, (..., 3, 3).
@@ -204,7 +204,7 @@ def geodesic(
         fraction: fraction of the geodesic, (...); batch axes broadcast.
 
     Returns:
-        Rotation matrices, (..., 3, 3). Between rotations that differ by a half turn they follow one of the two geodesics.
+        Rotation matrices, (..., 3, 3). Between rotations that differ by a half turn they follow one of two geodesics.
     """
     return multiply(R_a, exp(jnp.asarray(fraction)[..., None] * log(_relative(R_a, R_b))))
 
@@ -235,7 +235,9 @@ def translation(wxyz_xyz: Float[Array, "... 7"]) -> Float[Array, "... 3"]:
 
 @jax.jit
 def compose(a: Float[Array, "... 7"], b: Float[Array, "... 7"]) -> Float[Array, "... 7"]:
-    """Compose poses, b first: T_x_z = compose(T_x_y, T_y_z).
+    """Compose poses; b is applied first.
+
+    T_x_z is the composition of T_x_y and T_y_z.
 
     Args:
         a: poses `wxyz_xyz`, (..., 7), metres.
@@ -257,7 +259,7 @@ def compose(a: Float[Array, "... 7"], b: Float[Array, "... 7"]) -> Float[Array, 
 
 @jax.jit
 def inverse(a: Float[Array, "... 7"]) -> Float[Array, "... 7"]:
-    """Invert poses: compose(a, inverse(a)) is the identity.
+    """Invert poses.
 
     Args:
         a: poses `wxyz_xyz`, (..., 7), metres.

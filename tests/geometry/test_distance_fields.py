@@ -177,10 +177,13 @@ def test_distances_to_a_field_are_those_to_the_mug(mug):
 
 
 def test_a_field_without_a_surface_near_the_points_is_refused(field, monkeypatch):
-    points = random_cloud(3).astype(np.float32)
-    # a pea in the hollow
-    monkeypatch.setattr(occupied, "_excess", lambda field, x: 0.005 - jnp.linalg.norm(x - points.mean(axis=0), axis=-1))
-    with pytest.raises(InputError, match=r"field_obstacle\(\): of \d+ solid pieces none lies within 0.015 m"):
+    directions = random_cloud(3, 200) - random_cloud(3, 200).mean(axis=0)
+    points = np.float32(0.05 * directions / np.linalg.norm(directions, axis=1, keepdims=True) + [0.3, -0.2, 0.1])
+    # a pea in the middle of a hollow ball
+    monkeypatch.setattr(
+        occupied, "_log_odds", lambda field, x: 0.005 - jnp.linalg.norm(x - points.mean(axis=0), axis=-1)
+    )
+    with pytest.raises(InputError, match=r"field_obstacle\(\): of \d+ solid pieces none is within 0.015 m"):
         field_obstacle(field, points, pitch=0.005)
 
 
@@ -190,7 +193,8 @@ def test_a_field_without_a_surface_near_the_points_is_refused(field, monkeypatch
 def test_bad_input_is_refused(field):
     points = random_cloud(3).astype(np.float32)
     for centre, size, rotation, message in (
-        ((0, 0), SIZE, None, "centre is"), ((0, 0, 0), (1, 0, 1), None, "size is"), ((0, 0, 0), (1, 1), None, "size is"),
+        ((0, 0), SIZE, None, "centre is"),
+        ((0, 0, 0), (1, 0, 1), None, "size is"), ((0, 0, 0), (1, 1), None, "size is"),
         ((0, 0, 0), SIZE, np.ones((3, 3)), "not orthonormal"), ((0, 0, 0), SIZE, np.zeros(4), "quaternion"),
         ((0, 0, 0), SIZE, np.zeros(3), "rotation has shape"),
     ):  # fmt: skip
@@ -203,7 +207,7 @@ def test_bad_input_is_refused(field):
         cloud_obstacle(cloud[:3])
     for make in (lambda **bad: cloud_obstacle(cloud, **bad), lambda **bad: field_obstacle(field, points, **bad)):
         for bad in ({"pitch": 0.0}, {"pad": -1.0}, {"pitch": np.nan}):
-            with pytest.raises(InputError, match=f"{next(iter(bad))} is .*above 0"):
+            with pytest.raises(InputError, match=f"{next(iter(bad))} is .*expected a positive number, metres"):
                 make(**bad)
     with pytest.raises(InputError, match="expected at most 4000000 nodes; raise pitch"):
         cloud_obstacle(cloud, pitch=1e-4)

@@ -310,7 +310,7 @@ def test_group_axioms(u, v, t):
 
 
 def test_a_grid_of_rotations_leaves_no_large_hole():
-    """Alexa's spiral: with 512, no rotation is farther than 30 degrees from one of them; random ones leave larger holes."""
+    """Alexa's spiral: with 512, no rotation is farther than 30 degrees from the grid; random grids have larger gaps."""
     grid = se3.rotation_grid(512)
     np.testing.assert_allclose(grid @ grid.swapaxes(1, 2), np.broadcast_to(np.eye(3), grid.shape), atol=1e-5)
     probes = np.asarray(se3.uniform_rotations(jax.random.key(0), 2000))

@@ -12,7 +12,7 @@ import trimesh
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
-from tdf_jax.geometry.sampling import thin, farthest_point_indices
+from tdf_jax.geometry.sampling import farthest_point_indices, thin
 from tdf_jax.io.meshes import load_mesh
 from tdf_jax.io.pointclouds import load_points
 
@@ -30,11 +30,11 @@ def two_boxes():
 
 def write_ply(path, points):
     lines = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *(f"property float {a}" for a in "xyz")]
-    rows = ("%.9g %.9g %.9g" % tuple(point) for point in points)
+    rows = ("{:.9g} {:.9g} {:.9g}".format(*point) for point in points)
     path.write_text("\n".join([*lines, "end_header", *rows]) + "\n")
 
 
-def write_pcd(path, data, body, count=len(CLOUD)):
+def write_pcd(path, data, body, count=40):
     header = "# .PCD v0.7\nVERSION 0.7\nFIELDS _ x y z rgb _\nSIZE 1 4 4 4 4 1\nTYPE U F F F U U\nCOUNT 3 1 1 1 1 2\n"
     header += f"WIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA {data}\n"
     path.write_bytes(header.encode() + body)
@@ -58,9 +58,11 @@ def write_cloud(path):
         case "several.npz":
             np.savez(path, colours=np.zeros((2, 2)), points=CLOUD)
         case "cloud.xyz":
-            path.write_text("# x y z\n\n" + "".join("%.9g %.9g %.9g 0 0 1 # normal up\n" % tuple(p) for p in CLOUD))
+            path.write_text(
+                "# x y z\n\n" + "".join("{:.9g} {:.9g} {:.9g} 0 0 1 # normal up\n".format(*p) for p in CLOUD)
+            )
         case "ascii.pcd":
-            write_pcd(path, "ascii", "".join("1 2 3 %.9g %.9g %.9g 7 0 0\n" % tuple(p) for p in CLOUD).encode())
+            write_pcd(path, "ascii", "".join("1 2 3 {:.9g} {:.9g} {:.9g} 7 0 0\n".format(*p) for p in CLOUD).encode())
         case "binary.pcd":
             write_pcd(path, "binary", pcd_record())
         case "ascii.ply":
@@ -178,7 +180,7 @@ def test_meshes_without_faces_are_refused(tmp_path, suffix):
     if suffix == "ply":
         write_ply(path, CLOUD)
     elif suffix == "obj":
-        path.write_text("".join("v %.9g %.9g %.9g\n" % tuple(point) for point in CLOUD))
+        path.write_text("".join("v {:.9g} {:.9g} {:.9g}\n".format(*point) for point in CLOUD))
     else:
         path.write_bytes(DAMAGED["no_faces.off"])
     with pytest.raises(InputError, match=rf"load_mesh\(\): .*points.{suffix} has no faces"):

@@ -103,7 +103,7 @@ def test_a_box_across_a_line_is_passed_by_the_near_side():
 
 
 def test_a_wall_between_two_poses_is_seen_and_passed():
-    """Neither neighbour of the wall is nearer than 1.3 cm to it; and it is too wide to be left by its sides' gradients."""
+    """No pose is nearer than 1.3 cm to the wall, and the gradients at its sides do not lead out of it."""
     wall = box_obstacle((0.0, 0.1667, 0.05), (0.4, 0.002, 0.3))
     body = BODY * np.float32([1, 0.1, 1])
     found = clearance(LINE, body, [wall])
@@ -135,7 +135,7 @@ def test_several_obstacles_of_two_kinds_are_passed():
 
 
 def test_a_body_that_touches_at_the_pick_leaves_by_the_shortest_ramp():
-    """The cube stands on a table: it may be nearer than the margin near the pick, as near as the way from there is long."""
+    """The cube stands on a table: near the pick the required distance is the length of the path from there."""
     table = box_obstacle((0, 0, -0.05), (0.3, 0.3, 0.1))
     path = tdf.line(7, (0, 0, 0), (0, 0.4, 0.1))
     cleared = push_clear(path, BODY, [table])
