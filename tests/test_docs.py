@@ -2,12 +2,14 @@
 
 import importlib.util
 import json
+import pkgutil
 import re
 from pathlib import Path
 
 import pytest
 from test_layout import MAY_IMPORT
 
+import tdf_jax
 from tdf_jax.cli.main import COMMANDS, main
 
 ROOT = Path(__file__).parent.parent
@@ -84,3 +86,12 @@ def test_the_contributing_guide_has_the_table_of_imports():
     rows = re.findall(r"^\| `(\w+)` \| [^|]+ \| ([^|]+) \|$", (ROOT / "CONTRIBUTING.md").read_text(), re.MULTILINE)
     listed = {name: tuple(re.findall(r"`(\w+)`", imports)) for name, imports in rows}
     assert listed == {name: tuple(imports) for name, imports in MAY_IMPORT.items()}
+
+
+@pytest.mark.parametrize("page", [page for page in WRITTEN if page.name != "CHANGELOG.md"], ids=lambda page: page.name)
+def test_names_in_the_documentation_exist(page):
+    words = text(page)
+    for name in set(re.findall(r"\btdf\.(\w+)", words)) - {"X"}:
+        assert hasattr(tdf_jax, name), f"tdf.{name}"
+    for path in set(re.findall(r"`(tdf_jax(?:\.\w+)+)", words)):
+        pkgutil.resolve_name(path)
