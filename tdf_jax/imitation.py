@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from tdf_jax._internal import checks
@@ -112,8 +113,9 @@ def _judged(result: Result, weights: str, field, points) -> Result:
             stacklevel=4,  # the caller of `imitate`, whose decorator is one frame
         )
     known = {"recognised": recognised, "confidence": confident}
+    # In numpy, because under `jax_debug_nans` an array of jax must not hold NaN.
     return dataclasses.replace(
-        result, **{name: jnp.asarray(jnp.nan if value is None else value) for name, value in known.items()}
+        result, **{name: np.asarray(np.nan if value is None else value, np.float32) for name, value in known.items()}
     )
 
 

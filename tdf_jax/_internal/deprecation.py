@@ -34,6 +34,8 @@ def renamed_keywords(**new_names: str):
 def renamed_fields(**new_names: str | tuple[str, ...]):
     """Decorator of a dataclass whose fields were renamed: old keywords and attributes still work.
 
+    An old keyword takes precedence over the new one, because `dataclasses.replace(config, old=...)` passes both.
+
     A field that was a tuple by position may have become several fields: `renamed_fields(steps=("first_steps",
     "last_steps"))`.
     """
@@ -51,9 +53,6 @@ def renamed_fields(**new_names: str | tuple[str, ...]):
                 values = tuple(value) if several and isinstance(value, tuple | list) else (value,)
                 if len(values) != len(names):
                     raise InputError(f"{cls.__name__}(): {old} is {value!r}; expected {', '.join(names)}")
-                for name in names:
-                    if name in keywords:
-                        raise InputError(f"{cls.__name__}(): got {name} and {old}, its former name; expected {name}")
                 warn(f"{cls.__name__}({old}=...)", ", ".join(f"{name}=" for name in names))
                 keywords.update(zip(names, values))
             original(self, *arguments, **keywords)

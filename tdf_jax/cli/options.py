@@ -1,8 +1,9 @@
 """Options of `tdf imitate` and `tdf landscape`."""
 
 import dataclasses
+import functools
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, TypeVar, cast
 
 import numpy as np
 import tyro
@@ -20,11 +21,11 @@ from tdf_jax.io.pointclouds import load_points
 from tdf_jax.landscape.shortest_path import SHARPEST
 from tdf_jax.shapes import FAMILIES
 
-SEEDS = 2**32  # jax cuts a larger one to 32 bits without a word
+SEEDS = 2**32  # jax truncates a larger seed to 32 bits without a warning
 
 
 def _option(metavar: str | None = None, default: str | None = None):
-    """How the help names a value and a default that is not one."""
+    """The words of the help for a value, and for a default that depends on other options."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=None if default is None else f"(default: {default})")
 
 
@@ -34,16 +35,16 @@ class SceneSettings:
 
     Attributes:
         target: mesh or point cloud of the new object.
-        scale: metres per unit of the target file: 0.01 for centimetres.
-        target_pose: how the target lies in the world: as its file says, or moved by a random rotation and translation.
-        demonstration: .npz with points (N, 3), wxyz_xyz (n, 7) and query (Q, 3), in metres.
-        category: of generated objects.
+        scale: metres per unit of the target file, such as 0.01 for centimetres.
+        target_pose: pose of the target in the world: that of its file, or a random rotation and translation of it.
+        demonstration: .npz file with points (N, 3), wxyz_xyz (n, 7) and query (Q, 3), in metres.
+        category: category of generated objects.
         trajectory: shape of a generated demonstration, from a mug's handle, a bowl's rim or a bottle's neck to a place
-            0.30 m away; lift_over sets it down on a shelf there.
-        num_poses: of the trajectory; a demonstration file is resampled to another number.
-        queries: query points of a generated demonstration.
-        points: drawn from a mesh, or from a larger cloud.
-        seed: of every draw.
+            0.30 m away; lift_over ends on a shelf there.
+        num_poses: number of poses of the trajectory; a demonstration file is resampled to another number.
+        queries: number of query points of a generated demonstration.
+        points: number of points that are sampled from a mesh or a larger cloud.
+        seed: seed of all random numbers.
         weights: a name of shipped weights, or a .safetensors file.
     """
 
@@ -69,17 +70,17 @@ class SceneSettings:
 
 @dataclasses.dataclass(frozen=True)
 class Settings(SceneSettings):
-    """What to imitate, on what, and how.
+    """The demonstration, the target and the method of an imitation.
 
     Attributes:
-        goal_offset: metres in the world, added to where the last pose goes.
+        goal_offset: translation that is added to the goal, metres, world frame.
         k: weight of the correlation term of eq. 3, for the methods that minimise it; the paper's best is 0.02.
         method: carry the demonstration from the pick to the goal; or minimise the paper's energy, eq. 3, by damped
-            Gauss-Newton steps, or by Adam's as the paper does.
+            Gauss-Newton, or by Adam as in the paper.
         num_starts: number of random starts.
-        iterations: Adam's steps.
-        out: folder to write; an earlier result there is replaced.
-        no_plots: leave out imitation.png and loss.png.
+        iterations: number of Adam's steps.
+        out: folder of the results; an earlier result there is replaced.
+        no_plots: write no imitation.png and loss.png.
         json: print result.json instead of the table.
     """
 
@@ -97,27 +98,28 @@ class Settings(SceneSettings):
 
 @dataclasses.dataclass(frozen=True)
 class LandscapeSettings(SceneSettings):
-    """What to sweep the query frame over, and how.
+    """The grid, the query points and the orientations of a landscape.
 
     Attributes:
-        target_pose: as its file says, or moved by a random rotation and translation.
-        grid: a plane through the middle of the demonstration's path, a volume about it, or the path's neighbourhood;
-            along the axes of the orientation, or of the world where there are many.
-        half: of the plane's or volume's side, metres.
-        radius: of the neighbourhood of a path, metres.
-        pitch: distance of neighbouring points, metres; the side is rounded to whole ones.
-        query: a lattice of the grid's pitch in the box of the demonstration's query points, or those points moved onto
-            it, or as they are: some thirty times slower in one orientation; with many, a lattice would save nothing.
-        rotation: of the query frame: the demonstration's at the pick, the world's axes (as in the paper), the best of
-            many at every point, or the pick's turned about an axis, the best at every point.
-        rotations: number of them for "best" and "turns".
-        axis: of "turns", in the world.
+        target_pose: pose of the target in the world: that of its file, or a random rotation and translation of it.
+        grid: a plane through the middle of the demonstrated path, a volume about it, or the neighbourhood of the path;
+            its axes are those of the orientation, or of the world if there are many orientations.
+        half: half of the edge of the plane or the volume, metres.
+        radius: radius of the neighbourhood of a path, metres.
+        pitch: distance of neighbouring grid points, metres; the edge is rounded to a multiple of it.
+        query: query points: a lattice of the grid's pitch in the box of the demonstration's query points, those points
+            moved onto the lattice, or those points unchanged. Unchanged points take far longer in one orientation;
+            with many orientations, a lattice saves nothing.
+        rotation: orientation of the query frame: that of the pick in the demonstration, the axes of the world (as in
+            the paper), the best of many at every point, or the best of rotations of the pick about an axis.
+        rotations: number of orientations for "best" and "turns".
+        axis: axis of "turns", world frame.
         reduce: how the waypoints' energies are combined: the least, a soft least, each in its ring about the pick, or
             the mean.
-        sharpness: of the lowest-cost path from the pick to the goal: power of the energy that it adds up.
-        no_page: leave out landscape.html.
-        out: folder to write; an earlier result there is replaced.
-        no_plots: leave out all pictures and the page.
+        sharpness: exponent of the energy in the cost of the lowest-cost path from the pick to the goal.
+        no_page: write no landscape.html.
+        out: folder of the results; an earlier result there is replaced.
+        no_plots: write no pictures and no page.
         json: print result.json instead of the table.
     """
 
@@ -143,14 +145,20 @@ class LandscapeSettings(SceneSettings):
 
 
 def categories_of(weights: str | None) -> tuple[str, ...]:
-    """Categories that shipped weights were made for; mugs, of other files."""
+    """Categories of shipped weights; mugs for other files."""
     if weights == "multi":
         return tuple(FAMILIES)
     return (weights,) if weights in FAMILIES else ("mug",)
 
 
-def resolved(settings: SceneSettings) -> SceneSettings:
-    """The settings with the defaults filled in that depend on others.
+AnySettings = TypeVar("AnySettings", bound=SceneSettings)
+
+
+def resolved(settings: AnySettings) -> AnySettings:
+    """Fill in the defaults that depend on other options.
+
+    Args:
+        settings: settings of a command.
 
     Raises:
         InputError: a bad number, or options that contradict each other.
@@ -162,7 +170,8 @@ def resolved(settings: SceneSettings) -> SceneSettings:
     if isinstance(settings, LandscapeSettings):
         generated = "given"
         one = settings.rotation in ("pick", "identity")
-        settings = dataclasses.replace(settings, query=settings.query or ("lattice" if one else "given"))
+        query = settings.query or ("lattice" if one else "given")
+        settings = cast(AnySettings, dataclasses.replace(settings, query=query))
     pose = settings.target_pose or (generated if settings.target is None else "given")
     if settings.demonstration is None:
         return dataclasses.replace(
@@ -188,7 +197,8 @@ def _check_numbers(settings: SceneSettings) -> None:
     if isinstance(settings, Settings):
         if settings.k is not None and settings.method == "carry":
             raise InputError(
-                "tdf imitate: --k is a weight of eq. 3, which --method carry does not minimise; drop it, or add --method gauss-newton or adam"
+                "tdf imitate: --k is a weight of eq. 3, which --method carry does not minimise; drop it, or add --method "
+                "gauss-newton or adam"
             )
         if settings.num_starts is not None and settings.num_starts < 1:
             raise InputError(f"tdf imitate: --num-starts is {settings.num_starts}; expected at least 1")
@@ -206,13 +216,15 @@ def _check_numbers(settings: SceneSettings) -> None:
                 )
         if settings.grid != "path" and settings.half < settings.pitch / 2:
             raise InputError(
-                f"tdf landscape: --half is {settings.half}; expected at least half the pitch of {settings.pitch}: two points a side"
+                f"tdf landscape: --half is {settings.half}; expected at least half the pitch of {settings.pitch}: two "
+                "points a side"
             )
         if not 0 <= settings.sharpness <= SHARPEST:
             raise InputError(f"tdf landscape: --sharpness is {settings.sharpness}; expected 0 to {SHARPEST:g}")
         if settings.grid == "path" and settings.pitch > settings.radius:
             raise InputError(
-                f"tdf landscape: --pitch is {settings.pitch} and --radius {settings.radius}; expected a pitch of at most the radius"
+                f"tdf landscape: --pitch is {settings.pitch} and --radius {settings.radius}; expected a pitch of at most "
+                "the radius"
             )
         if settings.rotations < 1:
             raise InputError(f"tdf landscape: --rotations is {settings.rotations}; expected at least 1")
@@ -222,57 +234,63 @@ def make_scene(settings: SceneSettings, key: PRNGKeyArray) -> Scene:
     """Read or generate both objects.
 
     Args:
-        settings: resolved.
-        key: of the query points.
+        settings: settings from `resolved`.
+        key: random key of the query points.
 
     Raises:
         InputError: a file that cannot be used, or a number that makes no trajectory.
     """
-    shown, found = _read_demonstration(settings), _read_target(settings)
-    pair, shown_mesh, places = None, None, None
+
+    @functools.cache  # generated after both files were read, so that an error in a file is reported at once
+    def pair() -> Case:
+        return generated_case(cast(str, settings.category), settings.seed, 0, points=settings.points)
+
+    demonstration, target = _read_demonstration(settings), _read_target(settings)
+    demonstrated_mesh, places, fold = None, None, 1
     T_world_target = np.eye(4) if settings.target_pose == "given" else random_pose(settings.seed, 0)
-    if shown is None or found is None:  # after the files: a bad one is told at once
-        pair = generated_case(settings.category, settings.seed, 0, points=settings.points)
-    if found is None:
-        T_object_world = np.linalg.inv(pair.T_world_b)
-        found = _moved(pair.points_b, T_object_world), pair.object_b.mesh
-        if shown is None:
-            places = (pair.T_world_place_a, T_world_target @ T_object_world @ pair.T_world_place_b)
-    if shown is None:
-        shown, shown_mesh = _generated(settings, pair, key), pair.object_a.mesh
-    points, mesh = found
+    if target is None:
+        T_object_world = np.linalg.inv(pair().T_world_b)
+        target = _moved(pair().points_b, T_object_world), pair().object_b.mesh
+        if demonstration is None:
+            places = (pair().T_world_place_a, T_world_target @ T_object_world @ pair().T_world_place_b)
+            fold = pair().fold
+    if demonstration is None:
+        demonstration, demonstrated_mesh = _generated(settings, pair(), key), pair().object_a.mesh
+    points, mesh = target
     return Scene(
-        demonstration=shown,
+        demonstration=demonstration,
         points=_moved(points, T_world_target),
         T_world_target=T_world_target,
         T_world_places=places,
-        meshes=(shown_mesh, None if mesh is None else mesh.copy().apply_transform(T_world_target)),
-        fold=1 if places is None else pair.fold,
+        meshes=(demonstrated_mesh, None if mesh is None else mesh.copy().apply_transform(T_world_target)),
+        fold=fold,
     )
 
 
 def _read_demonstration(settings: SceneSettings) -> Demonstration | None:
     if settings.demonstration is None:
         return None
-    shown = load_demonstration(settings.demonstration)
-    if settings.num_poses in (None, shown.trajectory.num_poses):
-        return shown
-    return dataclasses.replace(shown, trajectory=resample(shown.trajectory, settings.num_poses))
+    demonstration = load_demonstration(settings.demonstration)
+    if settings.num_poses is None or settings.num_poses == demonstration.trajectory.num_poses:
+        return demonstration
+    trajectory = resample(demonstration.trajectory, settings.num_poses)
+    return dataclasses.replace(demonstration, trajectory=trajectory)
 
 
 def _read_target(settings: SceneSettings):
-    """Points and, if it has faces, the mesh."""
+    """Points and, if the file has faces, the mesh."""
     if settings.target is None:
         return None
     points = load_points(settings.target, settings.points, settings.scale, settings.seed)
     try:
         return points, load_mesh(settings.target, settings.scale)
-    except InputError:  # not a mesh, then: it has just been read as a cloud
+    except InputError:  # the file has no faces; it has just been read as a cloud
         return points, None
 
 
 def _generated(settings: SceneSettings, pair: Case, key: PRNGKeyArray) -> Demonstration:
-    return place_demonstration(pair, settings.trajectory, settings.num_poses, box_query(key, settings.queries, QUERY_SIZE))
+    trajectory, num_poses = cast(str, settings.trajectory), cast(int, settings.num_poses)
+    return place_demonstration(pair, trajectory, num_poses, box_query(key, cast(int, settings.queries), QUERY_SIZE))
 
 
 def _moved(points, T):

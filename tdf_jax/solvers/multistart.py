@@ -51,7 +51,7 @@ SAME_ANGLE, SAME_DISTANCE = np.radians(10), 0.01  # radians and metres within wh
     chunk="chunk_queries",
     steps=tuple(f"{stage}_steps" for stage in STAGES),
 )
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class SolveConfig:
     """Settings of `solve`.
 
@@ -260,14 +260,14 @@ def solve(
     losses = losses.T.astype(starts.dtype)
     free_poses = _poses(ordered, problem)
     ends = np.broadcast_to(starts[:1, free:], (len(free_poses), n - free, 7))
-    result = Result(
-        trajectories=np.concatenate([free_poses, ends], axis=1),
-        energies=losses[:, -1],
-        candidate_history=losses[:, :-1],
-        initial_trajectories=starts,
+    return Result(
+        trajectories=jnp.asarray(np.concatenate([free_poses, ends], axis=1)),
+        energies=jnp.asarray(losses[:, -1]),
+        candidate_history=jnp.asarray(losses[:, :-1]),
+        initial_trajectories=jnp.asarray(starts),
+        # It stays in numpy: under `jax_debug_nans` an array of jax must not hold NaN.
         history=_history(followed, len(starts), losses.shape[1] - 1, fixed, n).astype(starts.dtype),
     )
-    return jax.tree.map(jnp.asarray, result)
 
 
 def _history(followed, num_starts, length, fixed, n):

@@ -35,7 +35,7 @@ from tdf_jax.solvers.result import Result
     chunk="chunk_queries",
     steps=("coarse_steps", "prune_steps", "refine_steps", "polish_steps"),
 )
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class CarryConfig:
     """Settings of `carry`: those of the solver that finds the pick.
 
@@ -145,5 +145,5 @@ def carry(
         result,
         trajectories=trajectories[:count],
         initial_trajectories=trajectories[count:],
-        residual=jnp.asarray(residual, result.energies.dtype),
+        residual=np.asarray(residual, result.energies.dtype),
     )

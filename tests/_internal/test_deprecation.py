@@ -1,10 +1,15 @@
 """Names of the release before: accepted with a warning, and equal in what they do."""
 
+import dataclasses
+
+import jax
 import numpy as np
 import pytest
 
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
+from tdf_jax.geometry import se3
+from tdf_jax.solvers.result import Result
 
 PATHS = ["line", "semicircle", "wave", "lift_over", "tilt_and_pour", "hang_on_rack"]
 
@@ -31,3 +36,117 @@ def test_both_names_at_once_are_refused():
 def test_a_trajectory_has_poses():
     with pytest.warns(DeprecationWarning, match=r"^Trajectory.poses is deprecated; use Trajectory.num_poses$"):
         assert tdf.line(5).poses == 5
+
+
+@pytest.mark.parametrize(
+    ("config", "old", "new"),
+    [
+        (tdf.OptimizeConfig, {"inits": 3, "chunk": 2}, {"num_starts": 3, "chunk_poses": 2}),
+        (
+            tdf.SolveConfig,
+            {"inits": 3, "scouts": 5, "points": 8, "finalists": 1, "chunk": 64},
+            {
+                "num_trajectory_starts": 3,
+                "num_starts": 5,
+                "num_coarse_queries": 8,
+                "num_candidates": 1,
+                "chunk_queries": 64,
+            },
+        ),
+        (
+            tdf.CarryConfig,
+            {"scouts": 5, "points": 8, "finalists": 2, "chunk": 64},
+            {"num_starts": 5, "num_coarse_queries": 8, "num_candidates": 2, "chunk_queries": 64},
+        ),
+        (tdf.EnergyWeights, {"lever": 0.1}, {"rotation_scale": 0.1}),
+    ],
+)
+def test_settings_take_their_former_names(config, old, new):
+    with pytest.warns(DeprecationWarning) as warned:
+        made = config(**old)
+    assert made == config(**new)
+    assert {str(one.message) for one in warned} == {
+        f"{config.__name__}({name}=...) is deprecated; use {now}=" for name, now in zip(old, new)
+    }
+    for name, value in old.items():
+        with pytest.warns(DeprecationWarning, match=rf"{config.__name__}.{name} is deprecated"):
+            assert getattr(made, name) == value
+
+
+def test_steps_by_position_become_stages_by_name():
+    with pytest.warns(DeprecationWarning, match="use coarse_steps=, prune_steps=, search_steps=, propagate_steps="):
+        solver = tdf.SolveConfig(steps=(1, 2, 3, 4, 5, 6))
+    assert (solver.coarse_steps, solver.search_steps, solver.polish_steps, solver.num_steps) == (1, 3, 6, 21)
+    with pytest.warns(DeprecationWarning):
+        assert solver.steps == (1, 2, 3, 4, 5, 6)
+    with pytest.warns(DeprecationWarning):
+        assert tdf.CarryConfig(steps=(1, 2, 3, 4)) == tdf.CarryConfig(
+            coarse_steps=1, prune_steps=2, refine_steps=3, polish_steps=4
+        )
+    with pytest.raises(InputError, match=r"CarryConfig\(\): steps is \(1, 2\); expected coarse_steps, prune_steps"):
+        tdf.CarryConfig(steps=(1, 2))
+
+
+def test_a_result_has_losses_and_starts():
+    parts = {
+        "trajectories": np.zeros((1, 2, 7)),
+        "energies": np.zeros(1),
+        "candidate_history": np.ones((1, 3)),
+        "initial_trajectories": np.full((4, 2, 7), 2.0),
+        "history": np.zeros((4, 3)),
+    }
+    result = Result(**parts)
+    for old, new in (("losses", "candidate_history"), ("starts", "initial_trajectories")):
+        with pytest.warns(DeprecationWarning, match=f"Result.{old} is deprecated; use Result.{new}"):
+            assert getattr(result, old) is parts[new]
+
+
+def test_a_device_mesh_may_be_called_mesh(field, reference):
+    """Every function that takes one: what is no mesh is refused under the new name, so the old one was taken."""
+    key = jax.random.key(0)
+    for function, arguments in (
+        (tdf.optimize, (field, reference, key)),
+        (tdf.solve, (field, reference, key)),
+        (tdf.carry, (field, reference, key)),
+        (tdf.energy_landscape, (field, reference, tdf.plane_grid(0.1, 3))),
+    ):
+        with (
+            pytest.warns(DeprecationWarning, match=r"\(mesh=...\) is deprecated; use device_mesh="),
+            pytest.raises(InputError, match="device_mesh is 3; expected a jax.sharding.Mesh"),
+        ):
+            function(*arguments, mesh=3)
+
+
+def test_the_correlation_loss_takes_a_lever(field, reference):
+    trajectory = reference.trajectory.shifted(field.origin)
+    with pytest.warns(DeprecationWarning, match="use rotation_scale="):
+        old = tdf.correlation_loss(trajectory, field.origin, reference, lever=0.3)
+    np.testing.assert_array_equal(old, tdf.correlation_loss(trajectory, field.origin, reference, rotation_scale=0.3))
+
+
+def test_the_module_of_poses_is_still_there():
+    with pytest.warns(
+        DeprecationWarning, match="tdf_jax.poses is deprecated; use tdf_jax.turns and tdf_jax.rotation_grid"
+    ):
+        assert tdf.poses is se3
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        _ = tdf.nothing
+
+
+def test_replace_takes_former_names_too():
+    """It goes through the constructor, which gets the current value under the new name as well."""
+    assert dataclasses.replace(tdf.OptimizeConfig(), num_starts=2).num_starts == 2
+    with pytest.warns(DeprecationWarning, match="use num_starts="):
+        assert dataclasses.replace(tdf.OptimizeConfig(), inits=2).num_starts == 2
+    with pytest.warns(DeprecationWarning, match="use coarse_steps="):
+        assert dataclasses.replace(tdf.CarryConfig(), steps=(1, 2, 3, 4)).polish_steps == 4
+
+
+def test_clearance_takes_lever_and_has_least():
+    with pytest.warns(DeprecationWarning, match=r"^ClearanceConfig\(lever=...\) is deprecated; use rotation_scale=$"):
+        config = tdf.ClearanceConfig(lever=0.2)
+    with pytest.warns(DeprecationWarning, match=r"^ClearanceConfig.lever is deprecated; use ClearanceConfig.rotation_"):
+        assert config.lever == config.rotation_scale == 0.2
+    found = tdf.clearance(tdf.line(2), np.zeros((1, 3)), [tdf.box_obstacle((0.5, 0, 0), (0.2, 1, 1))], between=0)
+    with pytest.warns(DeprecationWarning, match=r"^Clearance.least is deprecated; use Clearance.min$"):
+        assert found.least == found.min == pytest.approx(0.4)

@@ -129,7 +129,7 @@ def test_the_record_tells_all_settings(folder, weights):
     assert (record["schema"], record["tdf_jax"], record["seed"]) == (report.SCHEMA, tdf.__version__, 0)
     assert record["settings"] == {
         "target": None, "scale": 1.0, "target_pose": "random", "demonstration": None, "category": "mug", "trajectory": "wave",
-        "goal_offset": [0.0, 0.0, 0.0], "k": None, "method": "adam", "inits": 2, "poses": 4, "queries": 8, "iterations": 3, "points": 60,
+        "goal_offset": [0.0, 0.0, 0.0], "k": None, "method": "adam", "num_starts": 2, "num_poses": 4, "queries": 8, "iterations": 3, "points": 60,
         "seed": 0, "weights": str(weights), "out": str(folder), "no_plots": False, "json": False,
     }  # fmt: skip
     assert record["energy"] == dataclasses.asdict(tdf.EnergyWeights(0.02))
@@ -256,7 +256,7 @@ def test_an_own_target_has_no_truth(imitate, tmp_path, capsys, kind):
 def test_scale_and_pose_of_an_own_target(tmp_path):
     np.save(tmp_path / "cloud.npy", cloud := np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32))
     settings = Settings(
-        target=tmp_path / "cloud.npy", category="mug", scale=0.1, target_pose="random", poses=3, queries=4
+        target=tmp_path / "cloud.npy", category="mug", scale=0.1, target_pose="random", num_poses=3, queries=4
     )
     made = scene.make_scene(dataclasses.replace(settings, trajectory="line"), jax.random.key(0))
     T = made.T_world_target
@@ -267,7 +267,7 @@ def test_scale_and_pose_of_an_own_target(tmp_path):
 
 def test_a_drawn_mesh_lies_where_its_points_do(tmp_path):
     path = mesh_file(tmp_path, "stl")
-    settings = Settings(target=path, category="mug", target_pose="random", trajectory="line", poses=2, queries=4)
+    settings = Settings(target=path, category="mug", target_pose="random", trajectory="line", num_poses=2, queries=4)
     for one in (settings, dataclasses.replace(settings, target=None)):
         made = scene.make_scene(one, jax.random.key(0))
         for points, mesh in zip((made.demonstration.points, made.points), made.meshes):
@@ -282,7 +282,7 @@ def test_every_path_can_be_named():
 
 @pytest.mark.parametrize("shape", PATHS)
 def test_generated_demonstrations_go_from_the_handle_to_the_place(shape):
-    settings = Settings(category="mug", trajectory=shape, poses=5, queries=7, target_pose="given")
+    settings = Settings(category="mug", trajectory=shape, num_poses=5, queries=7, target_pose="given")
     made = scene.make_scene(settings, jax.random.key(0))
     shown, (handle_a, handle_b) = made.demonstration, made.T_world_places
     ends = shown.trajectory.matrices
@@ -371,7 +371,7 @@ def test_bad_target_files(refusal, weights, tmp_path, name):
     (("--method", "gauss-newton", "--k", "nan"), "--k is nan"),
     (("--k", "0.02"), "--k is a weight of eq. 3, which --method carry does not minimise"),
     (("--num-poses", "1"), "poses is 1; expected a whole number of at least 2"),
-    (("--num-starts", "0"), "--inits is 0"),
+    (("--num-starts", "0"), "--num-starts is 0"),
     (("--method", "adam", "--iterations", "0"), "iterations is 0"),
     (("--iterations", "50"), "--iterations is for --method adam"),
     (("--queries", "0"), "count is 0"),
@@ -673,7 +673,7 @@ def test_every_condition_can_be_asked_for():
     (("--seed", "-1"), "--seed is -1"),
     (("--size", "12"), "--size is 12.0; expected metres"),
     (("--place", "spout"), "--place is 'spout'; expected one of a mug's: handle, rim, base"),
-    (("--num-starts", "0"), "inits is 0"),
+    (("--num-starts", "0"), "num_starts is 0"),
     (("--clouds", "fog"), "views1"),
     (("--meshes", "none"), "load_annotated.*there is no folder none"),
     (("--meshes", "."), "load_annotated.*is empty"),

@@ -123,9 +123,9 @@ def test_equation_2_is_the_mean_absolute_difference():
     ("settings", "turn"),
     [
         ({}, 2.0),  # ||R - I||_F of a quarter turn: four entries of 1
-        ({"lever": 0.05}, 0.1),
+        ({"rotation_scale": 0.05}, 0.1),
         ({"pose_norm": "metres_radians"}, np.pi / 2),
-        ({"pose_norm": "metres_radians", "lever": 0.05}, np.pi / 40),
+        ({"pose_norm": "metres_radians", "rotation_scale": 0.05}, np.pi / 40),
     ],
 )
 def test_equation_3_is_the_mean_distance_of_centred_poses(settings, turn):
@@ -216,12 +216,12 @@ def test_weights_are_traced(energy, current, field, reference):
         energy(current, field, reference, tdf.EnergyWeights(correlation=0.5, compensator=0.1, rotation_scale=1.0))
     assert compiled == []
     slope = jax.jit(jax.grad(tdf.trajectory_energy, argnums=3))(current, field, reference, tdf.EnergyWeights())
-    correlation = tdf.correlation_loss(current, field.origin, reference, tdf.EnergyWeights().lever)
+    correlation = tdf.correlation_loss(current, field.origin, reference, tdf.EnergyWeights().rotation_scale)
     np.testing.assert_allclose(slope.correlation, correlation, rtol=1e-5)
     np.testing.assert_allclose(slope.compensator, tdf.compensator_loss(current), rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["correlation", "compensator", "lever"])
+@pytest.mark.parametrize("name", ["correlation", "compensator", "rotation_scale"])
 @pytest.mark.parametrize("value", [-1, -1e-9, np.inf, np.nan, np.float32(-1)])
 def test_bad_weights_are_refused(name, value):
     with pytest.raises(InputError, match=rf"EnergyWeights\(\): {name} is"):

@@ -81,7 +81,7 @@ def test_clouds_are_thinned_to_the_networks_density(small_model, demonstration, 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"points": np.zeros((5, 3))}, "demonstration's points has 5 points"),
+        ({"points": np.zeros((5, 3))}, r"Demonstration\(\): points has 5 points"),
         ({"points": np.full((40, 3), np.nan)}, "NaN or infinite"),
         ({"trajectory": np.zeros((4, 7))}, "trajectory is a ndarray; expected a Trajectory"),
         ({"trajectory": tdf.Trajectory(jnp.zeros((4, 7)))}, "quaternion"),

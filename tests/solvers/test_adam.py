@@ -155,7 +155,7 @@ def test_progress_can_cancel(field, reference):
 
 def test_results_are_a_function_of_the_key(field, reference, result):
     again, other = run(field, reference), run(field, reference, key=jax.random.key(1))
-    for name in ("trajectories", "losses", "energies", "starts"):
+    for name in ("trajectories", "energies", "candidate_history", "initial_trajectories"):
         np.testing.assert_array_equal(getattr(again, name), getattr(result, name))
     assert np.abs(other.initial_trajectories - result.initial_trajectories)[:, :-1].max() > 0.01
 
@@ -239,7 +239,7 @@ def test_mixed_precisions_promote(field, reference, result):
     with jax.enable_x64(True):
         mixed = dataclasses.replace(reference, query=jnp.asarray(reference.query, jnp.float64))
         double = run(field, mixed, starts=result.initial_trajectories)
-        assert {x.dtype for x in jax.tree.leaves(double)} == {jnp.dtype("float64")}
+        assert {x.dtype for x in jax.tree.leaves(double) if x.ndim} == {jnp.dtype("float64")}
         np.testing.assert_allclose(double.candidate_history[:, 0], result.candidate_history[:, 0], rtol=1e-4)
 
 
@@ -313,11 +313,11 @@ def test_memory_does_not_grow_with_the_number_of_starts(quick_compilation):
     def array(*shape):
         return jax.ShapeDtypeStruct(shape, jnp.float32)
 
-    def temporary_bytes(inits):
+    def temporary_bytes(num_starts):
         params = unflatten_dict({name: array(*shape) for name, shape in parameter_shapes(config).items()}, sep=".")
         conditioned = jax.eval_shape(lambda params, z: condition(params, config, z), params, array(64, 3))
         reference = Reference(array(7, 64, config.channels), tdf.Trajectory(array(7, 7)), array(64, 3))
-        starts = array(inits, 7, 7)
+        starts = array(num_starts, 7, 7)
         state = jax.eval_shape(_begin, starts, reference.query)
         weights = jax.tree.map(lambda _: array(), WEIGHTS)
         steps = jax.ShapeDtypeStruct((), jnp.int32)
@@ -339,11 +339,11 @@ def test_memory_does_not_grow_with_the_number_of_starts(quick_compilation):
 @pytest.mark.parametrize(
     ("settings", "name"),
     [
-        ({"inits": 0}, "inits"),
-        ({"inits": 2.5}, "inits"),
-        ({"inits": True}, "inits"),
+        ({"num_starts": 0}, "num_starts"),
+        ({"num_starts": 2.5}, "num_starts"),
+        ({"num_starts": True}, "num_starts"),
         ({"iterations": 0}, "iterations"),
-        ({"chunk": 0}, "chunk"),
+        ({"chunk_poses": 0}, "chunk_poses"),
         ({"rotation_rate": 0.0}, "rotation_rate"),
         ({"translation_rate": np.nan}, "translation_rate"),
         ({"final_rate": -1.0}, "final_rate"),
@@ -362,7 +362,7 @@ def test_bad_settings_are_refused(settings, name):
     ids=["short", "batch", "no-turn", "nan", "infinite"],
 )
 def test_bad_goals_are_refused(field, reference, goal):
-    with pytest.raises(InputError, match=r"optimize\(\): goal of shape .* expected one finite pose"):
+    with pytest.raises(InputError, match=r"optimize\(\): goal (has shape|is) .*expected one (finite )?pose"):
         run(field, reference, goal=goal)
 
 
@@ -372,7 +372,7 @@ def test_bad_starts_are_refused(field, reference, result):
         result.initial_trajectories[:, :3],
         result.initial_trajectories[..., :6],
     ):
-        with pytest.raises(InputError, match=r"optimize\(\): starts have shape .* expected \(inits, 4, 7\)"):
+        with pytest.raises(InputError, match=r"optimize\(\): starts have shape .* expected \(starts, 4, 7\)"):
             run(field, reference, starts=starts)
     with jax.debug_nans(False):
         with pytest.raises(InputError, match="NaN or infinite"):
@@ -388,7 +388,7 @@ def test_a_reference_of_another_network_is_refused(field, reference):
 
 
 @pytest.mark.parametrize("value", [-0.1, np.nan, np.inf])
-@pytest.mark.parametrize("name", ["correlation", "compensator", "lever"])
+@pytest.mark.parametrize("name", ["correlation", "compensator", "rotation_scale"])
 def test_bad_weights_given_as_arrays_are_refused(field, reference, name, value):
     with pytest.raises(InputError, match=rf"optimize\(\): energy.{name} is"):
         run(field, reference, energy=dataclasses.replace(tdf.EnergyWeights(), **{name: jnp.float32(value)}))

@@ -125,8 +125,8 @@ def test_a_step_solves_the_damped_system_and_is_bounded():
     fall = -(gradient * expected).sum(axis=1) - np.einsum("ca,cab,cb->c", expected, hessian, expected) / 2
     np.testing.assert_allclose(promise, fall, rtol=1e-3)
     long, _ = gauss_newton._step(state._replace(gradient=1e4 * state.gradient), damping)
-    assert np.linalg.norm(long[:, :3], axis=1).max() <= gauss_newton.LARGEST_TURN * (1 + 1e-6)
-    assert np.linalg.norm(long[:, 3:], axis=1).max() <= gauss_newton.LARGEST_MOVE * (1 + 1e-6)
+    assert np.linalg.norm(long[:, :3], axis=1).max() <= gauss_newton.LARGEST_ROTATION * (1 + 1e-6)
+    assert np.linalg.norm(long[:, 3:], axis=1).max() <= gauss_newton.LARGEST_TRANSLATION * (1 + 1e-6)
     cosine = (long * expected).sum(axis=1) / np.linalg.norm(long, axis=1) / np.linalg.norm(expected, axis=1)
     np.testing.assert_allclose(cosine, 1, atol=1e-4)
 
@@ -161,7 +161,9 @@ def test_carried_candidates_are_rigid_motions_of_the_demonstration(field, refere
     found = Candidates(drawn.R[:, :3], drawn.centroid[:, :3], energy)
     picked = Candidates(drawn.R[2:, 1:2], drawn.centroid[2:, 1:2])
     shown_candidates = solve._candidates(reference.trajectory.wxyz_xyz, problem)
-    new = np.array(solve._poses(solve._propagated(found, picked, 1, shown_candidates, field.origin), problem), np.float64)
+    new = np.array(
+        solve._poses(solve._propagated(found, picked, 1, shown_candidates, field.origin), problem), np.float64
+    )
     assert new.shape == (6, 3, 7)
     shown = np.array(reference.trajectory.shifted(field.origin).wxyz_xyz[:3], np.float64)
     for index, (row, waypoint) in enumerate(
@@ -206,6 +208,39 @@ def test_energies_are_those_of_the_trajectories_and_the_first_is_the_best(result
     for stage in (slice(0, 3), slice(3, 5), slice(5, 7), slice(7, 10)):
         assert (np.diff(result.candidate_history[:, stage], axis=1) <= 1e-7).all()
     assert (result.energies <= result.candidate_history[:, -1] + 1e-7).all()
+
+
+def test_the_history_of_a_start_begins_at_its_energy_and_ends_where_it_is_dropped(field, reference):
+    """With all query points in every stage, energies of poses are those of the history."""
+    one = dataclasses.replace(
+        reference, descriptors=reference.descriptors[:1], trajectory=tdf.Trajectory(reference.trajectory.wxyz_xyz[:1])
+    )
+    config = dataclasses.replace(CONFIG, num_starts=8, num_coarse_queries=8, tolerance=0.0)
+    result = run(field, one, fix_last=False, config=config)
+    assert result.initial_trajectories.shape == (8, 1, 7) and result.history.shape == (
+        8,
+        result.candidate_history.shape[1],
+    )
+    initial = energy_of(result.initial_trajectories, field, one)
+    np.testing.assert_allclose(result.history[:, 0], initial, rtol=1e-5)
+    followed = np.isfinite(result.history)
+    assert (np.diff(followed.astype(int), axis=1) <= 0).all()  # a dropped start does not come back
+    assert followed[:, : config.coarse_steps].all()
+    np.testing.assert_array_equal(followed[:, config.coarse_steps :].sum(axis=0), config.num_candidates)
+    best = np.sort(np.asarray(result.history)[followed[:, -1], -1])
+    np.testing.assert_allclose(best, np.sort(result.candidate_history[:, -1]), rtol=1e-6)
+
+
+def test_whole_trajectories_are_followed_in_the_search_only(result):
+    assert (
+        result.initial_trajectories.shape[0]
+        == result.history.shape[0]
+        == max(CONFIG.num_starts, CONFIG.num_trajectory_starts)
+    )
+    followed = np.isfinite(result.history)
+    expected = np.zeros_like(followed)
+    expected[: CONFIG.num_trajectory_starts, : CONFIG.search_steps] = True
+    np.testing.assert_array_equal(followed, expected)
 
 
 def test_the_last_pose_is_fixed_at_the_goal_exactly(field, reference, result):
@@ -326,14 +361,13 @@ def test_stages_and_what_is_traced_share_one_program(small_model, field, referen
 @pytest.mark.parametrize(
     ("settings", "name"),
     [
-        ({"inits": 0}, "inits"),
-        ({"points": 2.5}, "points"),
-        ({"scouts": True}, "scouts"),
-        ({"steps": (1, 2, 3)}, "steps"),
-        ({"steps": 5}, "steps"),
-        ({"steps": (1, 1, 1, 1, 1, 0)}, "steps"),
-        ({"finalists": 0}, "finalists"),
-        ({"chunk": 0}, "chunk"),
+        ({"num_trajectory_starts": 0}, "num_trajectory_starts"),
+        ({"num_coarse_queries": 2.5}, "num_coarse_queries"),
+        ({"num_starts": True}, "num_starts"),
+        ({"coarse_steps": 5.0}, "coarse_steps"),
+        ({"polish_steps": 0}, "polish_steps"),
+        ({"num_candidates": 0}, "num_candidates"),
+        ({"chunk_queries": 0}, "chunk_queries"),
         ({"tolerance": -0.1}, "tolerance"),
         ({"tolerance": np.nan}, "tolerance"),
         ({"start_radius": np.inf}, "start_radius"),

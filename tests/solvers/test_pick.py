@@ -157,7 +157,7 @@ def test_the_residual_is_that_of_the_best_pick(result, picked):
     descriptors = np.asarray(alone.descriptors[0], float)
     expected = solved.loss / np.abs(descriptors - descriptors.mean(axis=0)).mean()
     np.testing.assert_allclose(result.residual, expected, rtol=1e-5)
-    assert result.confidence is None  # `imitate` knows the weights, and whether a curve was fitted to them
+    assert np.isnan(result.confidence)  # `imitate` knows the weights, and whether a curve was fitted to them
 
 
 def test_one_query_point_has_no_residual(small_model, field, demonstration):
@@ -171,7 +171,7 @@ def test_one_query_point_has_no_residual(small_model, field, demonstration):
         ({"goal": np.zeros(7)}, "quaternion not zero"),
         ({"goal": np.ones(6)}, "shape"),
         ({"key": 3}, "key"),
-        ({"mesh": "all"}, "mesh"),
+        ({"device_mesh": "all"}, "device_mesh"),
         ({"config": tdf.SolveConfig()}, "expected a CarryConfig"),
     ],
 )
@@ -191,9 +191,9 @@ def test_one_pose_that_is_kept_leaves_nothing_to_find(field, reference):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"scouts": 0}, r"^CarryConfig\(\): scouts is 0"),
-        ({"steps": (1, 2, 3)}, "tuple of four"),
-        ({"steps": (1, 2, 3, 0)}, r"^CarryConfig\(\): steps is .*tuple of four"),
+        ({"num_starts": 0}, r"^CarryConfig\(\): num_starts is 0"),
+        ({"refine_steps": 1.5}, r"^CarryConfig\(\): refine_steps is 1.5; expected a whole number of at least 1"),
+        ({"polish_steps": 0}, r"^CarryConfig\(\): polish_steps is 0"),
         ({"tolerance": -1}, r"^CarryConfig\(\): tolerance"),
     ],
 )
@@ -206,9 +206,11 @@ def test_the_calibration_is_for_the_shipped_weights(small_model, reference):
     """Others have a residual, and `confidence` may be fitted to theirs."""
     cloud = random_cloud(3).astype(np.float32)
     result = tdf.imitate(small_model, reference, cloud, key=KEY, config=CONFIG)
-    assert result.confidence is None and result.residual > 0
+    assert np.isnan(result.confidence) and result.residual > 0
     named = dataclasses.replace(small_model, info=dataclasses.replace(small_model.info, name="mug"))
-    assert tdf.imitate(named, reference, cloud, key=KEY, config=CONFIG).confidence == tdf.confidence(result.residual)
+    assert tdf.imitate(named, reference, cloud, key=KEY, config=CONFIG).confidence == np.float32(
+        tdf.confidence(float(result.residual))
+    )
 
 
 def test_without_a_finite_start_the_result_says_so(monkeypatch, field, reference, result):

@@ -83,7 +83,7 @@ def test_shipped_weights_judge_the_object_and_others_do_not(small_model, monkeyp
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert found("mine", (0.0, 0.0, 0.0))[1].recognised is None
+        assert np.isnan(found("mine", (0.0, 0.0, 0.0))[1].recognised)
         assert found("mug", (2.0, 0.0, 0.0))[1].recognised == pytest.approx(1 / (1 + np.exp(-2)))
     with pytest.warns(
         tdf.CategoryWarning,

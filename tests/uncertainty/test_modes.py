@@ -153,7 +153,7 @@ def squares(weights):
 def test_a_quadratic_energy_has_its_own_curvature_and_covariance():
     field, reference, pose, expected = squares((1.0, 3.0, 8.0))
     found = pose_covariance(field, reference, pose, scale=2e-6)
-    assert found.lever == pytest.approx(np.sqrt(np.mean(EXTENTS**2)), rel=1e-5)
+    assert found.rotation_scale == pytest.approx(np.sqrt(np.mean(EXTENTS**2)), rel=1e-5)
     np.testing.assert_allclose(found.centre, 0, atol=1e-7)
     size = np.sqrt(np.outer(expected, expected))
     np.testing.assert_allclose(found.curvature / size, np.eye(6), atol=0.02)
@@ -167,9 +167,9 @@ def test_an_energy_that_ignores_one_axis_leaves_a_move_free():
     np.testing.assert_allclose(np.abs(found.free), [[0, 0, 0, 1, 0, 0]], atol=2e-3)
     (screw,) = found.screws
     np.testing.assert_allclose(np.abs(screw.direction), [1, 0, 0], atol=2e-3)
-    assert abs(screw.pitch) > 100 * found.lever
-    # What is not known has a variance all the same, a radian at the lever; the others are as before.
-    np.testing.assert_allclose(found.covariance[3, 3], found.lever**2, rtol=0.01)
+    assert abs(screw.pitch) > 100 * found.rotation_scale
+    # What is not known has a variance all the same, a radian at the rotation_scale; the others are as before.
+    np.testing.assert_allclose(found.covariance[3, 3], found.rotation_scale**2, rtol=0.01)
     np.testing.assert_allclose(
         np.diagonal(found.covariance)[[0, 1, 2, 4, 5]], 2 * 2e-6 / expected[[0, 1, 2, 4, 5]], rtol=0.02
     )
@@ -189,7 +189,7 @@ def test_where_nothing_changes_everything_is_free():
     field, reference, pose, _ = squares((0.0, 0.0, 0.0))
     found = pose_covariance(field, reference, pose)
     assert found.free.shape == (6, 6)
-    np.testing.assert_allclose(found.covariance, np.diag([1.0] * 3 + [found.lever**2] * 3), atol=1e-6)
+    np.testing.assert_allclose(found.covariance, np.diag([1.0] * 3 + [found.rotation_scale**2] * 3), atol=1e-6)
 
 
 def test_where_the_energy_falls_the_curvature_is_negative_and_the_direction_counts_as_free():
@@ -250,7 +250,7 @@ def test_one_sigma_along_the_axes_raises_the_energy_by_the_scale(shown, referenc
     pose, scale = demonstration.trajectory.wxyz_xyz[3], 2e-6
     found = pose_covariance(shown, reference, pose, 3, scale=scale)
     sigma = np.sqrt(2 * scale / np.asarray(found.values))
-    assert sigma.max() < np.radians(15) * found.lever and sigma.max() > 10 * sigma.min()
+    assert sigma.max() < np.radians(15) * found.rotation_scale and sigma.max() > 10 * sigma.min()
     R, middle = se3.rotation(pose), jnp.mean(reference.query, axis=0)
 
     def energy(twist):
@@ -266,7 +266,7 @@ def test_one_sigma_along_the_axes_raises_the_energy_by_the_scale(shown, referenc
     # The three descriptions of the ellipsoid are of the same one.
     directions, values = (np.asarray(part, np.float64) for part in (found.directions, found.values))
     np.testing.assert_allclose(directions @ found.curvature @ directions.T, np.diag(values), atol=1e-4 * values[-1])
-    measured = directions * np.repeat([found.lever**2, 1], 3)
+    measured = directions * np.repeat([found.rotation_scale**2, 1], 3)
     np.testing.assert_allclose(
         measured @ found.covariance @ measured.T, np.diag(sigma**2), atol=1e-4 * sigma.max() ** 2
     )
