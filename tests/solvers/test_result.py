@@ -1,0 +1,99 @@
+"""A result on canned numbers: what is best, on batches and traced values, and what it prints."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import random_poses
+
+import tdf_jax as tdf
+from tdf_jax._internal.errors import InputError
+from tdf_jax.solvers.result import Result
+
+
+@pytest.fixture(autouse=True)
+def nan_is_a_value():
+    """Of what is unknown, and of candidates that diverged."""
+    with jax.debug_nans(False):
+        yield
+
+
+def canned(energies=(0.3, 0.1, 0.2), starts=6, **known):
+    """Three candidates of two poses from six starts."""
+    trajectories = jnp.asarray(random_poses(0, 6).reshape(3, 2, 7), jnp.float32)
+    return Result(
+        trajectories=trajectories,
+        energies=jnp.asarray(energies, jnp.float32),
+        candidate_history=jnp.full((3, 4), 0.5),
+        initial_trajectories=jnp.zeros((starts, 2, 7)),
+        history=jnp.full((starts, 4), 0.5),
+        **known,
+    )
+
+
+def test_the_best_candidate_is_the_finite_one_of_least_energy():
+    result = canned()
+    assert type(result.best) is int and result.best == 1 and type(result.loss) is float
+    assert result.loss == pytest.approx(0.1)
+    np.testing.assert_array_equal(result.trajectory.wxyz_xyz, result.trajectories[1])
+    assert result.status == "all 3 candidates finite" and canned(starts=3).status == "all 3 starts finite"
+    lost = canned((0.3, np.nan, 0.2))
+    assert lost.best == 2 and lost.status == "1 of 3 candidates became non-finite: 1"
+    far = dataclasses.replace(canned(), trajectories=canned().trajectories.at[1, 0, 4].set(jnp.inf))
+    assert far.best == 2 and not far.finite[1]
+
+
+def test_no_finite_candidate_is_an_error():
+    with pytest.raises(
+        InputError, match="Result.best: 3 of 3 candidates became non-finite: 0, 1, 2; check the weights"
+    ):
+        _ = canned((np.nan, np.inf, np.nan)).trajectory
+
+
+def test_what_is_unknown_is_nan_and_every_field_is_an_array():
+    result = canned()
+    for field in dataclasses.fields(result):
+        assert isinstance(getattr(result, field.name), jax.Array | np.ndarray)
+    assert np.isnan([result.residual, result.confidence, result.recognised]).all()
+
+
+def test_properties_work_on_traced_values_and_on_batches():
+    results = [canned(), canned((0.1, 0.3, 0.2)), canned((np.nan, 0.3, 0.2))]
+    batch = jax.tree.map(lambda *parts: jnp.stack([jnp.asarray(part) for part in parts]), *results)
+    np.testing.assert_array_equal(batch.best, [1, 0, 2])
+    np.testing.assert_allclose(batch.loss, [0.1, 0.1, 0.2])
+    expected = np.stack([one.trajectory.wxyz_xyz for one in results])
+    np.testing.assert_array_equal(batch.trajectory.wxyz_xyz, expected)
+
+    def parts(result):
+        return result.best, result.loss, result.trajectory.wxyz_xyz, result.finite
+
+    for traced in (jax.jit(jax.vmap(parts)), jax.jit(parts)):
+        best, loss, wxyz_xyz, finite = traced(batch)
+        np.testing.assert_array_equal(best, [1, 0, 2])
+        np.testing.assert_allclose(loss, [0.1, 0.1, 0.2])
+        np.testing.assert_array_equal(wxyz_xyz, expected)
+        np.testing.assert_array_equal(finite, batch.finite)
+    assert int(jax.jit(parts)(canned((np.nan,) * 3))[0]) == 0  # inside a trace nothing can be raised
+
+
+def test_it_prints_a_summary():
+    result = canned(confidence=np.float32(0.93))
+    words = repr(result)
+    x, y, z = (f"{value:.3f}" for value in result.trajectories[1, 0, 4:])
+    assert f"xyz ({x}, {y}, {z}) m" in words
+    assert "0.10000 (others: 0.20000, 0.30000)" in words and "6, 3 candidates kept" in words
+    assert "0.93 that the pick is right" in words and "recognised  unknown" in words
+    modes = tdf.cluster_poses(result.trajectories[:, 0], result.energies)
+    assert f"{len(modes)} distinct picks" in words
+    page = result._repr_html_()
+    assert page.startswith("<table>") and page.count("<tr>") == len(words.splitlines()) - 1
+    assert "3 of 3 candidates became non-finite" in repr(canned((np.nan,) * 3))
+
+
+def test_a_batch_and_traced_values_print_their_shapes():
+    batch = jax.tree.map(lambda part: jnp.asarray(part)[None], canned())
+    assert "(1, 3, 2, 7)" in repr(batch)
+    jax.jit(lambda result: repr(result) and result.energies)(canned())
