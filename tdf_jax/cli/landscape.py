@@ -1,4 +1,4 @@
-"""`tdf landscape`: energies over a grid, from files or a pair of generated mugs to a folder of results."""
+"""`tdf landscape`: energies over a grid, for files or a pair of generated objects, in a folder of results."""
 
 import contextlib
 import dataclasses
@@ -6,10 +6,12 @@ import json
 import math
 import shutil
 import time
+from collections.abc import Generator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import tyro
 from tqdm import tqdm
@@ -36,25 +38,25 @@ from tdf_jax.viz import html
 
 RESULT = "result.json"
 NAMES = (RESULT, "landscape.npz", "map.png", "isosurface.png", "slices.gif", "landscape.html")
-SCHEMA = 1  # raised when a field of result.json changes its meaning or goes
+SCHEMA = 2  # raised when a key of result.json changes its name or its meaning
 STREAM = 0x1A2D5CA9  # folded into the seed's key
 SAVE_SECONDS = 20.0  # between saves of an unfinished sweep
 NUMBER = 4  # bytes
-LATTICE = 4096  # query points at most; 57 kB each with seven waypoints
-ROUTED = 1_000_000  # points of a grid at most for the lowest-cost path, by estimate 1 kB each
+MAX_QUERIES = 4096  # of a lattice; each needs tens of kilobytes
+MAX_PATH_POINTS = 1_000_000  # of a grid for the lowest-cost path, which needs about a kilobyte each
 
 
 def landscape(settings: Annotated[LandscapeSettings, tyro.conf.arg(name="")] = LandscapeSettings()) -> None:
-    """Sweep the query frame over a grid: where does each waypoint's descriptor find its like?
+    """Sweep the query frame over a grid, and compare its descriptors with those of every waypoint.
 
-    Writes a folder with result.json, landscape.npz, pictures and a page to turn by hand. A sweep that is interrupted is
-    kept beside it and goes on when the same command is run again.
+    Writes a folder with result.json, landscape.npz, pictures and an interactive page. A sweep that is interrupted is
+    kept beside the folder, and the same command continues it.
     """
     settings = resolved(settings)
     began = time.perf_counter()
-    model = load_model(settings.weights)
+    model = load_model(cast(str, settings.weights))
     scene = make_scene(settings, jax.random.fold_in(jax.random.key(settings.seed), STREAM))
-    field = encode(model, scene.points)
+    field = encode(model, jnp.asarray(scene.points))
     given = describe(model, scene.demonstration)
     waypoints = np.asarray(given.trajectory.translations + field.origin, dtype=float)
     rotations = _rotations(settings, np.asarray(given.trajectory.rotations[0], dtype=float))
@@ -73,7 +75,7 @@ def landscape(settings: Annotated[LandscapeSettings, tyro.conf.arg(name="")] = L
         expected = scene.expected(goal)
         expected = None if expected is None else np.asarray(expected.translations, dtype=float)
         path = None
-        if math.prod(grid.shape) <= ROUTED:
+        if math.prod(grid.shape) <= MAX_PATH_POINTS:
             ends = _ends(grid, waypoints[0] if expected is None else expected[0], np.asarray(goal[4:]))
             path = lowest_cost_path(found, *ends, settings.sharpness)
         change = None if settings.query == "given" else query_change(field, given, reference, grid, rotations[0])
@@ -88,7 +90,7 @@ def landscape(settings: Annotated[LandscapeSettings, tyro.conf.arg(name="")] = L
 
 
 def _rotations(settings, at_pick):
-    """R_world_query of the sweep, (rotations, 3, 3)."""
+    """Orientations R_world_query of the sweep, (rotations, 3, 3)."""
     if settings.rotation == "best":
         return se3.rotation_grid(settings.rotations)
     if settings.rotation == "turns":
@@ -108,7 +110,7 @@ def _grid(settings, waypoints, axes) -> Grid:
 
 
 def _check_size(settings, waypoints, count) -> None:
-    """Refuse what would not fit on the disk, before any work."""
+    """Refuse at once a landscape that would not fit on the disk."""
     sides = (
         np.full(3, 2 * settings.half) if settings.grid != "path" else np.ptp(waypoints, axis=0) + 2 * settings.radius
     )
@@ -118,13 +120,13 @@ def _check_size(settings, waypoints, count) -> None:
     free = shutil.disk_usage(parent).free if parent.is_dir() else math.inf
     if needed > free:
         raise InputError(
-            f"tdf landscape: {points:.3g} points with {count} waypoints need {needed / 1e9:.3g} GB, and {parent} has {free / 1e9:.3g} GB free; "
-            "expected a grid that fits: raise --pitch or lower --half"
+            f"tdf landscape: {points:.3g} points with {count} waypoints need {needed / 1e9:.3g} GB, and {parent} has "
+            f"{free / 1e9:.3g} GB free; expected a grid that fits: raise --pitch or lower --half"
         )
 
 
 def _check_extras(settings) -> None:
-    """Refuse at once what could not be drawn at the end."""
+    """Refuse at once a picture whose extra is not installed."""
     if settings.no_plots:
         return
     if settings.grid not in PLANES:
@@ -136,37 +138,37 @@ def _check_extras(settings) -> None:
 
 
 def _query(settings, query):
-    """The query points of the sweep: nodes of the grid's lattice, if wanted."""
+    """The query points of the sweep, on the lattice of the grid unless they are given."""
     if settings.query == "given":
         return query
     low, high = query.min(axis=0), query.max(axis=0)
     shape = [max(1, round(float(side) / settings.pitch) + 1) for side in high - low]
     if settings.query == "snapped":
         return np.asarray(snapped_query(query, settings.pitch, (low + high) / 2))
-    if math.prod(shape) > LATTICE:
+    if math.prod(shape) > MAX_QUERIES:
         raise InputError(
-            f"tdf landscape: a lattice of --pitch {settings.pitch} in the query points' box has {math.prod(shape)} points; expected at most "
-            f"{LATTICE}: raise --pitch, or use --query snapped"
+            f"tdf landscape: a lattice of --pitch {settings.pitch} in the query points' box has {math.prod(shape)} "
+            f"points; expected at most {MAX_QUERIES}: raise --pitch, or use --query snapped"
         )
-    # Along the query frame's axes, as the grid's are where there is one orientation.
+    # The lattice has the axes of the query frame, as the grid has in one orientation.
     return np.asarray(lattice_query(shape, settings.pitch, (low + high) / 2))
 
 
 def _swept(settings, field: DescriptorField, reference: Reference, grid: Grid, rotations) -> Landscape:
-    """The landscape, from where an interrupted sweep of the same stood."""
+    """The landscape; an interrupted sweep of the same landscape is continued."""
     file, about_now = _unfinished(settings), _digest(field, reference, grid, rotations)
     found, done = blank(field, reference, grid, rotations, settings.reduce), 0
     if file.exists():
         kept, about = load_landscape(file)
         if about.get("digest") != about_now:
             raise InputError(
-                f"tdf landscape: {file} is an unfinished sweep with other settings; expected the same ones to go on: give another --out, or "
-                "delete it"
+                f"tdf landscape: {file} is an unfinished sweep with other settings; expected the same settings: give "
+                "another --out, or delete it"
             )
         found, done = dataclasses.replace(kept, reduce=settings.reduce), about["done"]
     saved = time.monotonic()
     with (
-        contextlib.closing(fill(found, field, reference, done)) as parts,
+        contextlib.closing(cast(Generator, fill(found, field, reference, done))) as parts,
         tqdm(desc="sweeping", unit="tile", initial=done) as bar,
     ):
         try:
@@ -176,7 +178,7 @@ def _swept(settings, field: DescriptorField, reference: Reference, grid: Grid, r
                 if time.monotonic() - saved > SAVE_SECONDS and done < total:
                     save_landscape(file, found, {"digest": about_now, "done": done})
                     saved = time.monotonic()
-        finally:  # also when all is done: what comes next may fail or be interrupted
+        finally:  # a finished sweep is saved too, because the next steps may fail or be interrupted
             save_landscape(file, found, {"digest": about_now, "done": done})
     return found
 
@@ -186,19 +188,20 @@ def _unfinished(settings) -> Path:
 
 
 def _digest(field, reference, grid, rotations) -> str:
-    """What the energies are a function of."""
+    """A digest of all that the energies depend on."""
     leaves = [*jax.tree.leaves((field, reference)), grid.origin, grid.directions, *grid.coordinates, rotations]
     leaves += [] if grid.mask is None else [grid.mask]
-    # Parts are counted by tiles, so these too.
+    # Progress is counted in tiles, so the digest has the tiles too.
     query = np.asarray(reference.query, dtype=float)
     tiles = [shared_lattice.tiles(grid, shared_lattice.layers(grid, query @ R.T).span) for R in rotations]
     return digest(*leaves, repr(tiles).encode())[:16]
 
 
 def _ends(grid, start, goal):
-    """Start and goal moved to the nearest point of the grid, which may be a plane that passes them by."""
+    """Start and goal, moved to the nearest points of the grid, which may be a plane beside them."""
     points = grid.points[np.ones(grid.shape, bool) if grid.mask is None else grid.mask]
-    return [points[np.linalg.norm(points - end, axis=1).argmin()] for end in (start, goal)]
+    start, goal = (points[np.linalg.norm(points - end, axis=1).argmin()] for end in (start, goal))
+    return start, goal
 
 
 def _draw(settings, folder: Path, scene: Scene, found: Landscape, expected, path) -> None:
@@ -216,7 +219,7 @@ def _draw(settings, folder: Path, scene: Scene, found: Landscape, expected, path
 
 
 def _record(settings, found: Landscape, reference, change, waypoints, expected, path, seconds) -> dict:
-    """Everything about a sweep that result.json holds."""
+    """The content of result.json."""
     query = np.asarray(reference.query, dtype=float)
     layers = [shared_lattice.layers(found.grid, query @ R.T) for R in found.rotations]
     truth = waypoints if expected is None else expected
@@ -244,8 +247,8 @@ def _record(settings, found: Landscape, reference, change, waypoints, expected, 
 
 
 def _table(record: dict, out: Path) -> str:
-    """The record in a few lines."""
-    against = "the true waypoints" if record["truth"] is not None else "the demonstration's, moved with the centroid"
+    """The record as a table for the terminal."""
+    against = "the true waypoints" if record["truth"] is not None else "the demonstrated ones, moved with the centroid"
     change, route = record["query_change"], record["path_metres"]
     rows = {
         "grid": " x ".join(map(str, record["grid"]["shape"]))
@@ -256,7 +259,7 @@ def _table(record: dict, out: Path) -> str:
         else f"changes the energy by {change['median']:.1%} (median), {change['largest']:.1%} (most)",
         "energy": f"least {record['energy']['least']:.5f}, median {record['energy']['median']:.5f}",
         "minimisers": ", ".join(f"{100 * metres:.1f}" for metres in record["minimiser_metres"]) + f" cm from {against}",
-        "lowest-cost path": "not sought, the grid is too large"
+        "lowest-cost path": "not computed, the grid is too large"
         if route is None
         else f"{100 * route:.1f} cm from the polyline through them, mean",
         "time": f"{record['seconds']['total']:.1f} s, sweep {record['seconds']['sweep']:.1f}",

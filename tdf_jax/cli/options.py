@@ -197,8 +197,8 @@ def _check_numbers(settings: SceneSettings) -> None:
     if isinstance(settings, Settings):
         if settings.k is not None and settings.method == "carry":
             raise InputError(
-                "tdf imitate: --k is a weight of eq. 3, which --method carry does not minimise; drop it, or add --method "
-                "gauss-newton or adam"
+                "tdf imitate: --k is a weight of eq. 3, which --method carry does not minimise; drop it, or add "
+                "--method gauss-newton or adam"
             )
         if settings.num_starts is not None and settings.num_starts < 1:
             raise InputError(f"tdf imitate: --num-starts is {settings.num_starts}; expected at least 1")
@@ -223,8 +223,8 @@ def _check_numbers(settings: SceneSettings) -> None:
             raise InputError(f"tdf landscape: --sharpness is {settings.sharpness}; expected 0 to {SHARPEST:g}")
         if settings.grid == "path" and settings.pitch > settings.radius:
             raise InputError(
-                f"tdf landscape: --pitch is {settings.pitch} and --radius {settings.radius}; expected a pitch of at most "
-                "the radius"
+                f"tdf landscape: --pitch is {settings.pitch} and --radius {settings.radius}; expected a pitch of "
+                "at most the radius"
             )
         if settings.rotations < 1:
             raise InputError(f"tdf landscape: --rotations is {settings.rotations}; expected at least 1")

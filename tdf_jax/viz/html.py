@@ -69,7 +69,7 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
                 i=i,
                 j=j,
                 k=k,
-                color=matplotlib.colors.to_hex(polygons3d.SURFACE_COLOUR),
+                color=matplotlib.colors.to_hex(tuple(polygons3d.SURFACE_COLOUR)),
                 name="object",
                 showlegend=True,
             )

@@ -182,9 +182,8 @@ def isosurface(landscape: Landscape, share: float) -> Float[np.ndarray, "faces 3
     # Points outside the mask get the highest energy, so that no surface is drawn there.
     values = np.nan_to_num(energy, nan=np.nanmax(energy)).astype(float)
     points = landscape.grid.points.transpose(2, 1, 0, 3).reshape(-1, 3)  # the first axis is the fastest for libigl
-    vertices, faces, _ = igl.marching_cubes(
-        values.transpose(2, 1, 0).ravel(), points, *map(int, landscape.grid.shape), level
-    )
+    nx, ny, nz = (int(count) for count in landscape.grid.shape)
+    vertices, faces, _ = igl.marching_cubes(values.transpose(2, 1, 0).ravel(), points, nx, ny, nz, level)
     return np.asarray(vertices)[np.asarray(faces)].reshape(-1, 3, 3)
 
 

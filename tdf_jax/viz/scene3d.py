@@ -140,7 +140,7 @@ def frame(axes: Axes3D, content: Float[np.ndarray, "points 3"], size: Float[np.n
         axis._axinfo["grid"].update(color=(0.87, 0.87, 0.87), linewidth=0.5)
     axes.tick_params(pad=-2, labelsize=7)
     axes.patch.set_visible(False)
-    set_view(axes, size, 1.01, VIEW)
+    set_view(axes, tuple(size), 1.01, VIEW)
 
 
 def panels(

@@ -178,7 +178,7 @@ def test_the_path_is_as_sharp_as_asked_and_left_out_of_large_grids(sweep, monkey
     )
     sweep("--sharpness", 3)
     assert asked == [3.0]
-    monkeypatch.setattr(command, "ROUTED", 24)
+    monkeypatch.setattr(command, "MAX_PATH_POINTS", 24)
     record, _ = sweep("--reduce", "mean")
     assert record["path"] is None and record["path_metres"] is None
     assert asked == [3.0]

@@ -107,7 +107,7 @@ def test_the_turn_is_drawn_for_every_shape_beside_the_even_one():
     first, second = pictures.figure4_turn(runs).axes
     for axes, displacement in ((first, (0.0, 0.0, 0.0)), (second, figures.DISPLACED)):
         drawn = {line.get_label(): line.get_ydata() for line in axes.lines}
-        assert set(drawn) == {"line", "semicircle", "wave", "even turn to the goal"}
+        assert set(drawn) == {"line", "semicircle", "wave", "even rotation to the goal"}
         run = runs["wave", displacement]
         np.testing.assert_allclose(drawn["wave"], figures.turned(run.trajectory, run.reference))
 
@@ -157,7 +157,7 @@ def test_figure_2_shows_energies_the_way_round_they_are_with_all_marks():
     assert (row, column) == (0, 4)  # y is the mesh's first axis
     drawn = {line.get_label(): np.column_stack(line.get_data()) for line in first.lines}
     np.testing.assert_array_equal(drawn["demonstration"], panel.path)
-    np.testing.assert_array_equal(drawn["turned with the mug"], panel.carried)
+    np.testing.assert_array_equal(drawn["rotated with the mug"], panel.carried)
     np.testing.assert_array_equal(drawn[r"minimisers $x_i^*$"], panel.minimisers)
     np.testing.assert_array_equal(drawn["start"], panel.path[:1])
     np.testing.assert_array_equal(drawn["end"], panel.path[-1:])
@@ -185,7 +185,7 @@ def test_a_second_call_computes_nothing(everything, weights, monkeypatch, capsys
     """What an interruption leaves is gone on from, in any experiment that shares a run."""
     before = sorted(path.name for path in (everything / "runs").iterdir())
     for name in ("imitation", "figure2"):
-        monkeypatch.setattr(f"tdf_jax.experiments.store.{name}", lambda *_: pytest.fail("computed again"))
+        monkeypatch.setattr(f"tdf_jax.paper.store.{name}", lambda *_: pytest.fail("computed again"))
     (everything / "fig5.png").unlink()
     main(["reproduce", "fig5", "--fast", "--out", str(everything), "--weights", weights, *WORDS])
     assert (everything / "fig5.png").exists()
