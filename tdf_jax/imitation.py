@@ -31,11 +31,11 @@ DOUBT = 0.5  # probability of the demonstration's category below which a warning
 def imitate(
     model: Model,
     demonstration: Demonstration | Sequence[Demonstration] | Reference,
-    points: Float[Array, "points 3"],
+    points: Float[Array | np.ndarray, "points 3"],
     *,
     key: PRNGKeyArray,
-    goal: Float[Array, "7"] | None = None,
-    goal_offset: Float[Array, "3"] | None = None,
+    goal: Float[Array | np.ndarray, "7"] | None = None,
+    goal_offset: Float[Array | np.ndarray, "3"] | Sequence[float] | None = None,
     fix_last: bool = True,
     energy: EnergyWeights | None = None,
     config: CarryConfig | SolveConfig | OptimizeConfig = CarryConfig(),
@@ -79,8 +79,8 @@ def imitate(
         raise InputError(f"imitate(): config is {config!r}; expected a CarryConfig, SolveConfig or OptimizeConfig")
     if isinstance(config, CarryConfig) and energy is not None:
         raise InputError(
-            "imitate(): energy is given, but `carry` does not minimise eq. 3; expected no energy, or config=SolveConfig() "
-            "or OptimizeConfig() with it"
+            "imitate(): energy is given, but `carry` does not minimise eq. 3; expected no energy, or "
+            "config=SolveConfig() or OptimizeConfig() with it"
         )
     reference = demonstration if isinstance(demonstration, Reference) else describe(model, demonstration)
     field = encode(model, points)
@@ -92,10 +92,10 @@ def imitate(
     if isinstance(config, CarryConfig):
         result = carry(field, reference, key, config=config, **settings)
         return _judged(result, model.info.name, field, points)
-    minimise = optimize if isinstance(config, OptimizeConfig) else solve
-    return minimise(
-        field, reference, key, energy=EnergyWeights() if energy is None else energy, config=config, **settings
-    )
+    weights = EnergyWeights() if energy is None else energy
+    if isinstance(config, OptimizeConfig):
+        return optimize(field, reference, key, energy=weights, config=config, **settings)
+    return solve(field, reference, key, energy=weights, config=config, **settings)
 
 
 def _judged(result: Result, weights: str, field, points) -> Result:
@@ -122,7 +122,7 @@ def _judged(result: Result, weights: str, field, points) -> Result:
 def imitate_batch(
     model: Model,
     demonstration: Demonstration | Sequence[Demonstration] | Reference,
-    clouds: Iterable[Float[Array, "points 3"]],
+    clouds: Iterable[Float[Array | np.ndarray, "points 3"]],
     *,
     key: PRNGKeyArray,
     **settings,

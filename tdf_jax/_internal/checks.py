@@ -8,6 +8,8 @@ ones through, because they are not known yet.
 from collections.abc import Collection
 
 import jax
+import jax.core
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -58,7 +60,7 @@ def choice(function: str, name: str, value, choices: Collection[str]) -> str:
 
 def vector(function: str, name: str, value: ArrayLike, size: int = 3, unit: str = "metres") -> np.ndarray | jax.Array:
     """`size` finite numbers, as float64 unless they are traced."""
-    vector = jax.numpy.asarray(value) if traced(value) else _array(function, name, value)
+    vector = jnp.asarray(value) if traced(value) else _array(function, name, value)
     if vector.shape != (size,) or not (traced(vector) or np.isfinite(vector).all()):
         raise InputError(
             f"{function}: {name} is {value}; expected {_in_words(size)} finite numbers{unit and ', ' + unit}"
@@ -76,7 +78,7 @@ def direction(function: str, name: str, value: ArrayLike) -> np.ndarray | jax.Ar
 
 def lengths(function: str, name: str, value: ArrayLike, size: int = 3) -> np.ndarray | jax.Array:
     """`size` finite numbers above 0, metres, as float64 unless they are traced."""
-    lengths = jax.numpy.asarray(value) if traced(value) else _array(function, name, value)
+    lengths = jnp.asarray(value) if traced(value) else _array(function, name, value)
     if lengths.shape != (size,) or not (traced(lengths) or (np.isfinite(lengths) & (lengths > 0)).all()):
         raise InputError(f"{function}: {name} is {value}; expected {_in_words(size)} lengths above 0, metres")
     return lengths
@@ -84,7 +86,7 @@ def lengths(function: str, name: str, value: ArrayLike, size: int = 3) -> np.nda
 
 def coordinates(function: str, name: str, value: ArrayLike, rows: str = "points") -> np.ndarray | jax.Array:
     """Points in space, (rows, 3), at least one, finite; as an array of the caller's type."""
-    array = value if traced(value) else np.asarray(value)
+    array = jnp.asarray(value) if traced(value) else np.asarray(value)
     if array.ndim != 2 or array.shape[1] != 3 or not len(array) or array.dtype.kind not in "fiu":
         raise InputError(f"{function}: {name} has shape {array.shape}; expected numbers ({rows}, 3), metres")
     if not traced(array) and not np.isfinite(array).all():
@@ -118,7 +120,7 @@ def rotations(function: str, name: str, value: ArrayLike) -> ArrayLike:
 
 def orientation(function: str, name: str, value: ArrayLike) -> np.ndarray | jax.Array:
     """One rotation, as a matrix (3, 3) or a quaternion wxyz (4,) that is not zero; as float64 unless it is traced."""
-    orientation = jax.numpy.asarray(value) if traced(value) else _array(function, name, value)
+    orientation = jnp.asarray(value) if traced(value) else _array(function, name, value)
     if orientation.shape not in {(3, 3), (4,)}:
         raise InputError(f"{function}: {name} has shape {orientation.shape}; expected (3, 3), or (4,) as wxyz")
     if orientation.shape == (3, 3):
@@ -131,9 +133,7 @@ def orientation(function: str, name: str, value: ArrayLike) -> np.ndarray | jax.
 def key(function: str, value) -> jax.Array:
     """One random key, of `jax.random.key` or the older `jax.random.PRNGKey`."""
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", np.dtype(object))
-    if not (shape == () and jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key)) and not (
-        shape == (2,) and dtype == np.uint32
-    ):
+    if not (shape == () and jnp.issubdtype(dtype, jax.dtypes.prng_key)) and not (shape == (2,) and dtype == np.uint32):
         got = repr(value) if shape is None or shape == () else f"an array of shape {shape}"
         raise InputError(f"{function}: key is {got}; expected one random key, such as jax.random.key(0)")
     return value
@@ -160,7 +160,7 @@ def points(function: str, value, name: str = "points"):
             raise InputError(f"{function}: {name} is not an array of numbers: {error}") from error
     if value.dtype.kind in "iu":
         value = value.astype(np.float32)
-    if not jax.numpy.issubdtype(value.dtype, np.floating):
+    if not jnp.issubdtype(value.dtype, np.floating):
         raise InputError(f"{function}: {name} has dtype {value.dtype}; expected floating point metres")
     if value.ndim != 2 or value.shape[1] != 3:
         raise InputError(f"{function}: {name} has shape {value.shape}; expected (points, 3)")

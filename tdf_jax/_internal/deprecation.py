@@ -49,7 +49,7 @@ def renamed_fields(**new_names: str | tuple[str, ...]):
                 if old not in keywords:
                     continue
                 value, several = keywords.pop(old), isinstance(new, tuple)
-                names = new if several else (new,)
+                names = new if isinstance(new, tuple) else (new,)
                 values = tuple(value) if several and isinstance(value, tuple | list) else (value,)
                 if len(values) != len(names):
                     raise InputError(f"{cls.__name__}(): {old} is {value!r}; expected {', '.join(names)}")

@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import numpy as np
@@ -95,9 +95,13 @@ def _run(settings: Settings, folder: Path) -> dict:
 
 
 def _config(settings: Settings) -> CarryConfig | SolveConfig | OptimizeConfig:
-    starts = {} if settings.num_starts is None else {"num_starts": settings.num_starts}
+    starts: dict[str, Any] = {} if settings.num_starts is None else {"num_starts": settings.num_starts}
     if settings.method == "adam":
-        return OptimizeConfig(**starts, **({} if settings.iterations is None else {"iterations": settings.iterations}))
+        return (
+            OptimizeConfig(**starts)
+            if settings.iterations is None
+            else OptimizeConfig(iterations=settings.iterations, **starts)
+        )
     if settings.iterations is not None:
         raise InputError("tdf imitate: --iterations is for --method adam; drop one or add the other")
     if settings.method == "gauss-newton":
@@ -111,11 +115,11 @@ def _draw(folder: Path, scene: Scene, result: Result, rows: str) -> None:
 
     trajectory = result.trajectory
     expected = scene.expected(trajectory.wxyz_xyz[-1], trajectory.wxyz_xyz[0])
-    title = _title(result.loss, _errors(trajectory, expected))
+    title = _title(float(result.loss), _errors(trajectory, expected))
     figure = imitation_figure(scene.demonstration, scene.points, trajectory, expected, scene.meshes, title)
     save_figure(folder / "imitation.png", figure)
     history = np.column_stack([result.candidate_history, result.energies])
-    save_figure(folder / "loss.png", loss_figure(history, result.best, rows=rows))
+    save_figure(folder / "loss.png", loss_figure(history, int(result.best), rows=rows))
 
 
 @contextlib.contextmanager

@@ -1,7 +1,7 @@
-"""Energies of one trajectory: how far it is from the demonstration's (eq. 2, 3 and 6 of the TDF paper).
+"""Energies of one trajectory: its distance from the demonstration (eq. 2, 3 and 6 of the TDF paper).
 
-Each function takes one trajectory; batches are made outside. The energy is a mean over poses of terms of one pose each,
-plus eq. 6, which couples neighbours: `optimize` uses that to hold one chunk of descriptors at a time.
+Each function takes one trajectory; the caller batches. The energy is a mean over poses of terms of one pose each, plus
+eq. 6, which couples neighbours. `optimize` relies on that to hold one chunk of descriptors at a time.
 """
 
 import dataclasses
@@ -31,18 +31,18 @@ COMPENSATOR_ORDERS = ("frobenius", "infinity")
 )
 @dataclasses.dataclass(frozen=True)
 class EnergyWeights:
-    """Weights of the terms; traced, so changing a number does not compile again.
+    """Weights of the energy's terms. They are traced, so a changed number does not compile again.
 
     Attributes:
         correlation: k of eq. 3; the paper's best is 0.02.
         compensator: weight of eq. 6, which the paper tried and rejected.
-        rotation_scale: metres that a turn of one unit counts as in eq. 3, where the paper does not say. At 1 m, the
-            plain norm, a turn outweighs the descriptors of a real, 0.1 m mug by far, and a mug that lies in another
-            orientation is not followed (docs/results/energy.md).
-        pose_norm: the norm of eq. 3, which the paper does not specify: "frobenius", of the difference of the 4x4
-            matrices, "metres_radians", sqrt(distance^2 + angle^2), or "mean_absolute", over the twelve numbers of (R,
-            t), as eq. 2 is over channels.
-        compensator_order: of eq. 6, see `compensator_loss`.
+        rotation_scale: metres that a rotation difference of one unit counts as in eq. 3, which the paper does not
+            state. At 1 m, the plain norm, the rotation outweighs the descriptors of a real mug by far, and the solution
+            does not follow a mug in another orientation (docs/guide/energy.md).
+        pose_norm: norm of eq. 3, which the paper does not specify: "frobenius", of the difference of the 4x4 matrices;
+            "metres_radians", sqrt(distance^2 + angle^2); or "mean_absolute", over the twelve numbers of (R, t), as eq.
+            2 is over channels.
+        compensator_order: norm over waypoints in eq. 6, see `compensator_loss`.
 
     Raises:
         InputError: a negative weight, or an unknown norm or order.
@@ -66,20 +66,32 @@ class EnergyWeights:
 def trajectory_energy(
     trajectory: Trajectory, field: DescriptorField, reference: Reference, weights: EnergyWeights
 ) -> Float[Array, ""]:
-    """The energy that imitation minimises: eq. 3, and eq. 6 where it has a weight.
+    """Energy that `optimize` and `solve` minimise: eq. 3, and eq. 6 if it has a weight.
 
     Args:
-        trajectory: poses of the query frame in the world.
-        field: the new object's.
-        reference: the demonstration's.
-        weights: of the terms.
+        trajectory: poses of the query frame, T_world_query.
+        field: descriptor field of the new object.
+        reference: the demonstration.
+        weights: weights of the terms.
+
+    Returns:
+        The energy, a scalar.
     """
     R, t = trajectory.rotations, trajectory.translations
     return descriptor_loss(trajectory, field, reference) + pose_energy(R, t, field.origin, reference, weights)
 
 
 def descriptor_loss(trajectory: Trajectory, field: DescriptorField, reference: Reference) -> Float[Array, ""]:
-    """l_t of eq. 2: mean absolute difference of descriptors over poses, queries and channels."""
+    """l_t of eq. 2: mean absolute difference of descriptors over poses, queries and channels.
+
+    Args:
+        trajectory: poses of the query frame, T_world_query.
+        field: descriptor field of the new object.
+        reference: the demonstration.
+
+    Returns:
+        The loss, a scalar.
+    """
 
     def one(pose):
         T_world_query, descriptors = pose
@@ -96,13 +108,17 @@ def waypoint_loss(
     query: Float[Array, "queries 3"],
     descriptors: Float[Array, "queries channels"],
 ) -> Float[Array, ""]:
-    """One waypoint's part of eq. 2: mean absolute difference over queries and channels.
+    """Term of one waypoint in eq. 2: mean absolute difference of descriptors over queries and channels.
 
     Args:
-        R, t: pose of the query frame in the world.
-        field: the new object's.
-        query: points in the query frame, metres.
-        descriptors: the demonstration's, of the same waypoint.
+        R: rotation of the query frame in the world, (3, 3).
+        t: translation of the query frame in the world, (3,), metres.
+        field: descriptor field of the new object.
+        query: query points, (queries, 3), metres, query frame.
+        descriptors: descriptors of the demonstration at the same waypoint, (queries, channels).
+
+    Returns:
+        The loss, a scalar.
     """
     return jnp.mean(jnp.abs(field.descriptors(se3.rotate(R, query) + t) - descriptors))
 
@@ -114,14 +130,19 @@ def pose_energy(
     reference: Reference,
     weights: EnergyWeights,
 ) -> Float[Array, ""]:
-    """What the energy adds to eq. 2: the weighted terms that depend on the poses alone.
+    """Weighted terms of the energy that depend on the poses alone, without descriptors.
+
+    It takes matrices because the optimiser has them: by way of quaternions it compiles longer.
 
     Args:
-        R, t: poses of the query frame in the world; matrices, for the optimiser has them: by way of quaternions it took
-            10.6 instead of 6.3 s of CPU to compile.
-        origin: centroid of the new object's cloud, metres, world frame.
-        reference: the demonstration's.
-        weights: of the terms.
+        R: rotations of the query frame in the world, (poses, 3, 3).
+        t: translations of the query frame in the world, (poses, 3), metres.
+        origin: centroid of the new object's cloud, (3,), metres, world frame.
+        reference: the demonstration.
+        weights: weights of the terms.
+
+    Returns:
+        The weighted sum of eq. 3's correlation term and eq. 6, a scalar.
     """
     correlation = _correlation(R, t, origin, reference, weights.rotation_scale, weights.pose_norm)
     return weights.correlation * correlation + weights.compensator * _compensator(R, t, weights.compensator_order)
@@ -137,13 +158,17 @@ def correlation_loss(
 ) -> Float[Array, ""]:
     """l_c of eq. 3: mean over waypoints of ||T_ref - T||, on poses relative to each cloud's centroid with world axes.
 
-    It follows the object's translation and not its rotation, which is the paper's limit.
+    The term follows the object's translation and not its rotation, which is a limit of the paper.
 
     Args:
-        trajectory: poses of the query frame in the world.
-        origin: centroid of the new object's cloud, metres, world frame.
-        reference: the demonstration's.
-        rotation_scale, pose_norm: see `EnergyWeights`; by default the plain Frobenius norm of the 4x4 matrices.
+        trajectory: poses of the query frame, T_world_query.
+        origin: centroid of the new object's cloud, (3,), metres, world frame.
+        reference: the demonstration.
+        rotation_scale: metres that a rotation difference of one unit counts as, see `EnergyWeights`.
+        pose_norm: norm of the difference, see `EnergyWeights`; by default the plain Frobenius norm of the 4x4 matrices.
+
+    Returns:
+        The loss, a scalar, metres.
     """
     return _correlation(trajectory.rotations, trajectory.translations, origin, reference, rotation_scale, pose_norm)
 
@@ -152,8 +177,11 @@ def compensator_loss(trajectory: Trajectory, order: str = "frobenius") -> Float[
     """l_p of eq. 6: sum over neighbouring waypoints of ||T_i^-1 T_{i+1} - I||_F.
 
     Args:
-        trajectory: poses of the query frame.
-        order: "frobenius", summed over pairs as in eq. 6, or "infinity", the largest of them.
+        trajectory: poses of the query frame, T_world_query.
+        order: "frobenius" sums over pairs as eq. 6 does; "infinity" takes the largest of them.
+
+    Returns:
+        The loss, a scalar.
 
     Raises:
         InputError: an unknown order.
@@ -170,13 +198,18 @@ def pose_difference(
     rotation_scale: Float[Array, ""] | float,
     pose_norm: str,
 ) -> Float[Array, "*batch numbers"]:
-    """What eq. 3 takes the norm of: how poses differ from the demonstration's, relative to each cloud's centroid; 12 numbers, or 4 of "metres_radians".
+    """Difference that eq. 3 takes the norm of: of poses from the demonstration's, relative to each cloud's centroid.
 
     Args:
-        R, t: poses of the query frame in the world.
-        origin: centroid of the new object's cloud, metres, world frame.
-        target: the demonstration's, relative to its centroid, `wxyz_xyz`.
-        rotation_scale, pose_norm: see `EnergyWeights`.
+        R: rotations of the query frame in the world, (*batch, 3, 3).
+        t: translations of the query frame in the world, (*batch, 3), metres.
+        origin: centroid of the new object's cloud, (3,), metres, world frame.
+        target: poses of the demonstration relative to its centroid, (*batch, 7), `wxyz_xyz`.
+        rotation_scale: metres that a rotation difference of one unit counts as.
+        pose_norm: see `EnergyWeights`.
+
+    Returns:
+        12 numbers a pose; 4 with "metres_radians".
     """
     translation = t - origin - se3.translation(target)
     if pose_norm == "metres_radians":
@@ -192,14 +225,17 @@ def _correlation(R, t, origin, reference, rotation_scale, pose_norm):
 
 
 def _compensator(R, t, order):
-    # ||T_i^-1 T_{i+1} - I||_F of neighbouring poses: a rotation more on both sides does not change it.
+    # ||T_i^-1 T_{i+1} - I||_F of neighbouring poses does not change if both are multiplied by one rotation.
     rotation = (R[1:] - R[:-1]).reshape(-1, 9)
     lengths = _norm(jnp.concatenate([t[1:] - t[:-1], rotation], axis=-1))
     return jnp.max(lengths) if order == "infinity" else jnp.sum(lengths)
 
 
 def _norm(x):
-    """Euclidean norm over the last axis, with gradient zero at zero (that of `jnp.abs` is 1): a fixed last pose is often exactly the reference's."""
+    """Euclidean norm over the last axis, with gradient zero at zero.
+
+    The gradient matters because a fixed last pose often equals the reference's exactly.
+    """
     squared = jnp.sum(x * x, axis=-1)
     zero = squared == 0
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))

@@ -25,7 +25,9 @@ SAME_SIDE = np.pi / 6
 
 
 @renamed_keywords(thinnings="num_subsamples")
-def encode(model: Model, points: Float[Array, "points 3"], num_subsamples: int = NUM_SUBSAMPLES) -> DescriptorField:
+def encode(
+    model: Model, points: Float[Array | np.ndarray, "points 3"], num_subsamples: int = NUM_SUBSAMPLES
+) -> DescriptorField:
     """Encode an object's point cloud into its descriptor field.
 
     A network expects clouds of the density that it was trained on (`model.info.cloud_points`). `encode` therefore takes
@@ -47,29 +49,29 @@ def encode(model: Model, points: Float[Array, "points 3"], num_subsamples: int =
         InputError: the points are fewer than 21 or than the network's neighbours, not (points, 3), not finite or all
             equal; `num_subsamples` is negative; or the points are denser than the network's and traced by `jax.jit`.
     """
-    points, count = checks.points("encode()", points), model.info.cloud_points
+    cloud, density = checks.points("encode()", points), model.info.cloud_points
     num_subsamples = checks.count("encode()", "num_subsamples", num_subsamples, 0)
-    if len(points) < model.config.neighbours:
+    if len(cloud) < model.config.neighbours:
         raise InputError(
-            f"encode(): there are {len(points)} points; expected at least the network's "
+            f"encode(): there are {len(cloud)} points; expected at least the network's "
             f"{model.config.neighbours} neighbours"
         )
-    traced = checks.traced(points)
-    dense = num_subsamples > 0 and count is not None and len(points) > count
+    plain, traced = num_subsamples == 0 or density is None, checks.traced(cloud)
+    count = len(cloud) if num_subsamples == 0 or density is None else density
+    dense = len(cloud) > count
     if traced and dense:
         raise InputError(
-            f"encode(): {len(points)} points cannot be subsampled to {count} under jax.jit; expected that many. "
+            f"encode(): {len(cloud)} points cannot be subsampled to {count} under jax.jit; expected that many. "
             "Subsample the cloud outside with tdf.thin, or pass num_subsamples=0"
         )
-    whole = points if traced else np.asarray(points)
+    whole = cloud if traced else np.asarray(cloud)
     # All subsamples share one anchor, so that they see the same side of a symmetric object as its front.
     anchor = whole[((whole - whole.mean(axis=0)) ** 2).sum(axis=1).argmax()]
-    clouds = sampling.subsamples(whole, count, num_subsamples) if dense else points[None]
+    clouds = sampling.subsamples(np.asarray(whole), count, num_subsamples) if dense else cloud[None]
     if traced or checks.traced(model.params):
         return _average(model.params, model.config, clouds, anchor)
     num_clouds, size = clouds.shape[:2]
     # Padding with clouds and points that do not count lets clouds of many sizes run one program.
-    plain = num_subsamples == 0 or count is None
     padded = (1, -(-size // PADDING) * PADDING) if plain else (num_subsamples, count)
     clouds = np.resize(clouds, (*padded, 3))
     return _encode(model.params, model.config, clouds, np.int32(num_clouds), np.int32(size), anchor)

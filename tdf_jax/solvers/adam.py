@@ -83,11 +83,11 @@ def optimize(
     reference: Reference,
     key: PRNGKeyArray,
     *,
-    goal: Float[Array, "7"] | None = None,
+    goal: Float[Array | np.ndarray, "7"] | None = None,
     fix_last: bool = True,
     energy: EnergyWeights = EnergyWeights(),
     config: OptimizeConfig = OptimizeConfig(),
-    starts: Float[Array, "starts poses 7"] | None = None,
+    starts: Float[Array | np.ndarray, "starts poses 7"] | None = None,
     progress: Callable[[int, Float[np.ndarray, " starts"]], None] | None = None,
     device_mesh: jax.sharding.Mesh | None = None,
 ) -> Result:
@@ -119,30 +119,30 @@ def optimize(
         InputError: starts, goal, weights or device mesh of a wrong shape, type or value, a reference from another
             network than the field, or one pose that is kept, so that nothing can move.
     """
-    starts, energy = prepare(
+    checked, energy = prepare(
         "optimize()", field, reference, key, goal, fix_last, energy, config, starts, device_mesh, config.num_starts
     )
-    num_starts, dtype = len(starts), starts.dtype
-    starts = jnp.asarray(starts)
+    num_starts, dtype = len(checked), checked.dtype
+    initial = jnp.asarray(checked)
     count = config.chunk_poses or max(1, devices.points_at_a_time(CHUNK_POINTS) // len(reference.query))
     program = functools.partial(_run, fix_last=fix_last, chunk=count, device_mesh=device_mesh)
     rates = np.array([config.rotation_rate, config.translation_rate, config.final_rate, config.iterations], dtype)
     if device_mesh is not None:
-        starts = devices.placed(devices.padded(starts, device_mesh), device_mesh, devices.sharded(device_mesh))
+        initial = devices.placed(devices.padded(checked, device_mesh), device_mesh, devices.sharded(device_mesh))
         field, reference, energy, rates = devices.placed((field, reference, energy, rates), device_mesh)
-    state = _begin(starts, reference.query)
+    state = _begin(initial, reference.query)
     losses = []
     for done in range(0, config.iterations, BLOCK):
         steps = min(BLOCK, config.iterations - done)
-        state, block = program(state, starts, field, reference, energy, rates, steps)
+        state, block = program(state, initial, field, reference, energy, rates, steps)
         losses.append(block[:, :steps])
         if progress is not None:
             progress(done + steps, devices.gathered(block)[:num_starts, steps - 1])
-    trajectories = _trajectories(state, starts, reference.query, fix_last=fix_last)
+    trajectories = _trajectories(state, initial, reference.query, fix_last=fix_last)
     # One more step, not kept: the energies after the last one, by the program that is compiled already.
-    _, block = program(state, starts, field, reference, energy, rates, 1)
+    _, block = program(state, initial, field, reference, energy, rates, 1)
     history = jnp.concatenate(losses, axis=1)
-    result = Result(trajectories, block[:, 0], history, starts, history)
+    result = Result(trajectories, block[:, 0], history, initial, history)
     if device_mesh is None:
         return result
     # Fields that are unknown are scalars of this process.
@@ -151,7 +151,10 @@ def optimize(
 
 @jax.jit
 def _begin(starts, query):
-    """The optimiser's state: the variables (rotation vectors away from the starts, centroids of the query centroid), Adam's moments, steps done."""
+    """Initial state of the optimiser: the variables, Adam's moments and the number of steps.
+
+    The variables are rotation vectors relative to the starts, and positions of the query points' centroid.
+    """
     centroids = se3.transform(starts, jnp.mean(query, axis=0)[None])[..., 0, :]
     variables = (jnp.zeros_like(centroids), centroids)
     return variables, optax.scale_by_adam().init(variables), jnp.zeros((), jnp.int32)
@@ -169,7 +172,7 @@ def _run(state, starts, field, reference, energy, rates, steps, *, fix_last, chu
     work = functools.partial(_steps, fix_last=fix_last, chunk=chunk)
     if device_mesh is not None:
         split, whole = devices.sharded(device_mesh), devices.REPLICATED
-        states = split, optax.ScaleByAdamState(whole, split, split), whole
+        states = split, optax.ScaleByAdamState(count=whole, mu=split, nu=split), whole  # pyright: ignore[reportArgumentType]
         work = jax.shard_map(
             work, mesh=device_mesh, in_specs=(states, split, *[whole] * 5), out_specs=(states, split), check_vma=False
         )
@@ -222,7 +225,7 @@ def _evaluator(starts, field, reference, energy, fix_last, chunk):
     fixed = 0.0
     if fix_last:
         last = start_rotations[:, -1], starts[:, -1, 4:]  # given starts may end apart
-        fixed = jax.lax.map(lambda pose: waypoint_loss(*pose, field, query, reference.descriptors[-1]), last)
+        fixed = jax.lax.map(lambda pose: waypoint_loss(pose[0], pose[1], field, query, reference.descriptors[-1]), last)
 
     def flat(x):
         return x[:, :free].reshape(num_starts * free, *x.shape[2:])

@@ -87,14 +87,16 @@ def descend(
     """Take damped Gauss-Newton steps until no pose promises to gain more than the tolerance.
 
     Args:
-        R, centroid: rotations of the query frame in the world, (poses, 3, 3), and positions of the query points'
-            centroid, (poses, 3), metres, world frame.
+        R: rotations of the query frame in the world, (poses, 3, 3).
+        centroid: positions of the query points' centroid, (poses, 3), metres, world frame.
         waypoint: index of the waypoint that each pose matches, (poses,).
         bounds: number of poses that move, number of poses that are evaluated, number of blocks of query points, and
             maximal number of steps, (4,).
         damping: damping of the first step.
         tolerance: share of a pose's energy that its next step has to promise; the loop ends when no pose promises it.
-        field, problem, energy: field, problem and weights that define the energy.
+        field: descriptor field of the new object.
+        problem: the demonstration, in blocks of query points.
+        energy: weights of the energy's terms.
         length: number of entries of a history.
         chunk: number of query points that are evaluated at a time.
         device_mesh: devices that share the poses, dealt out in turn.
@@ -205,7 +207,7 @@ def _evaluate(R, centroid, waypoint, bounds, field, problem, energy, chunk):
 
 
 def _match(R, centroid, field, query, weights, shown):
-    """Weighted sums over query points of the mean absolute difference of descriptors, its gradient and its model's curvature."""
+    """Weighted sum over query points of the mean absolute difference of descriptors, its gradient and its curvature."""
     arm = se3.rotate(R, query)
     x = (arm + centroid[:, None]).reshape(-1, 3)
 

@@ -23,11 +23,11 @@ def prepare(
     field: DescriptorField,
     reference: Reference,
     key: PRNGKeyArray,
-    goal: Float[Array, "7"] | None,
+    goal: Float[Array | np.ndarray, "7"] | None,
     fix_last: bool,
     energy: EnergyWeights,
     config,
-    starts: Float[Array, "starts poses 7"] | None,
+    starts: Float[Array | np.ndarray, "starts poses 7"] | None,
     device_mesh: jax.sharding.Mesh | None,
     num_starts: int,
 ) -> tuple[Float[np.ndarray, "starts poses 7"], EnergyWeights]:
@@ -35,8 +35,15 @@ def prepare(
 
     Args:
         function: name that begins the messages.
-        field, reference, key, goal, fix_last, energy, starts, device_mesh: see `optimize`.
+        field: see `optimize`.
+        reference: see `optimize`.
+        key: see `optimize`.
+        goal: see `optimize`.
+        fix_last: see `optimize`.
+        energy: see `optimize`.
         config: settings with the fields `start` and `start_radius`.
+        starts: see `optimize`.
+        device_mesh: see `optimize`.
         num_starts: number of random starts, if none are given.
 
     Returns:
@@ -64,21 +71,21 @@ def prepare(
         starts = random_starts(key, field, reference, num_starts, config.start, config.start_radius)
     if goal is not None:
         checks.pose(function, "goal", goal)
-    starts = np.asarray(starts)
-    if starts.ndim != 3 or starts.shape[1:] != (reference.trajectory.num_poses, 7):
+    given = np.asarray(starts)
+    if given.ndim != 3 or given.shape[1:] != (reference.trajectory.num_poses, 7):
         raise InputError(
-            f"{function}: starts have shape {starts.shape}; expected (starts, {reference.trajectory.num_poses}, 7), "
+            f"{function}: starts have shape {given.shape}; expected (starts, {reference.trajectory.num_poses}, 7), "
             "as many poses as the demonstration has"
         )
     # Every traced number gets one type. Mixed types promote, and a weight of 0 instead of 0.02 would compile again.
-    dtype = jnp.result_type(starts, reference.query, reference.descriptors, field.latent)
+    dtype = jnp.result_type(given, reference.query, reference.descriptors, field.latent)
     _check_weights(function, energy)
     energy = jax.tree.map(lambda weight: jnp.asarray(weight, dtype), energy)
-    starts = np.array(starts, dtype)
+    initial = np.array(given, dtype)
     if goal is not None:
-        starts[:, -1] = goal
-    check_trajectory(Trajectory(starts.reshape(-1, 7)), "starts")
-    return starts, energy
+        initial[:, -1] = goal
+    check_trajectory(Trajectory(jnp.asarray(initial.reshape(-1, 7))), "starts")
+    return initial, energy
 
 
 def default_goal(field: DescriptorField, reference: Reference) -> Float[Array, "7"]:
@@ -103,7 +110,8 @@ def random_starts(
         field: field of the new object; trajectories are drawn about its origin.
         reference: the demonstration.
         num_starts: number of starts.
-        start, radius: see `start` and `start_radius` of `OptimizeConfig`.
+        start: see `OptimizeConfig`.
+        radius: `start_radius` of `OptimizeConfig`, metres.
 
     Returns:
         Trajectories, T_world_query, metres.

@@ -126,14 +126,14 @@ class Candidates(NamedTuple):
     Attributes:
         R: rotations of the query frame in the world, (rows, free, 3, 3).
         centroid: positions of the query points' centroid, (rows, free, 3), metres, world frame.
-        energy: energy of each pose, (rows, free); infinite where a pose was not evaluated or is not finite.
-        history: energies at the start of the stage and after each step, (times, rows, free).
+        energy: energy of each pose, (rows, free), infinite where it is not finite; empty before a stage.
+        history: energies at the start of the stage and after each step, (times, rows, free); empty before a stage.
     """
 
     R: Float[np.ndarray, "rows free 3 3"]
     centroid: Float[np.ndarray, "rows free 3"]
-    energy: Float[np.ndarray, "rows free"] | None = None
-    history: Float[np.ndarray, "times rows free"] | None = None
+    energy: Float[np.ndarray, "rows free"] = np.empty((0, 0))
+    history: Float[np.ndarray, "times rows free"] = np.empty((0, 0, 0))
 
 
 @renamed_keywords(mesh="device_mesh")
@@ -142,11 +142,11 @@ def solve(
     reference: Reference,
     key: PRNGKeyArray,
     *,
-    goal: Float[Array, "7"] | None = None,
+    goal: Float[Array | np.ndarray, "7"] | None = None,
     fix_last: bool = True,
     energy: EnergyWeights = EnergyWeights(),
     config: SolveConfig = SolveConfig(),
-    starts: Float[Array, "starts poses 7"] | None = None,
+    starts: Float[Array | np.ndarray, "starts poses 7"] | None = None,
     progress: Callable[[int, Float[np.ndarray, " candidates"]], None] | None = None,
     device_mesh: jax.sharding.Mesh | None = None,
 ) -> Result:
@@ -176,29 +176,28 @@ def solve(
     """
     checks.key("solve()", key)
     num_starts = max(config.num_starts, config.num_trajectory_starts)
-    given = starts is not None
-    starts, energy = prepare(
+    initial, energy = prepare(
         "solve()", field, reference, key, goal, fix_last, energy, config, starts, device_mesh, num_starts
     )
     if energy.compensator != 0:
         raise InputError(
-            f"solve(): energy.compensator is {float(energy.compensator):g}; expected 0, because the solver takes waypoints "
-            "one by one. Use optimize(), or imitate() with config=OptimizeConfig()"
+            f"solve(): energy.compensator is {float(energy.compensator):g}; expected 0, because the solver takes "
+            "waypoints one by one. Use optimize(), or imitate() with config=OptimizeConfig()"
         )
-    n = starts.shape[1]
+    n = initial.shape[1]
     free = n - 1 if fix_last else n
-    if not (starts[:, free:] == starts[:1, free:]).all():
+    if not (initial[:, free:] == initial[:1, free:]).all():
         raise InputError(
             "solve(): the last poses of the starts differ and fix_last keeps them; expected one, or a goal"
         )
 
     problem = _problem(key, reference, min(config.num_coarse_queries, len(reference.query)))
     # The starts and the demonstration go through one program: a second one would take 0.15 s more to compile.
-    together = _candidates(np.concatenate([starts.reshape(-1, 7), problem.target]), problem)
-    drawn = Candidates(*(part[:-n].reshape(len(starts), n, *part.shape[1:]) for part in together[:2]))
+    together = _candidates(np.concatenate([initial.reshape(-1, 7), problem.target]), problem)
+    drawn = Candidates(*(part[:-n].reshape(len(initial), n, *part.shape[1:]) for part in together[:2]))
     demonstrated = Candidates(*(part[-n:] for part in together[:2]))
-    num_keyframes = len(starts) if given else config.num_starts
-    num_trajectories = len(starts) if given else config.num_trajectory_starts
+    num_keyframes = len(initial) if starts is not None else config.num_starts
+    num_trajectories = len(initial) if starts is not None else config.num_trajectory_starts
     kept = config.num_candidates
     room = max(num_keyframes, max(num_trajectories, free + kept + 1) * free + 1)
     shared, parts = (field, problem, energy), 1
@@ -257,16 +256,16 @@ def solve(
     ordered = Candidates(*(np.take_along_axis(part, _like(order, part), axis=0) for part in found[:2]))
     curves.append(np.take_along_axis(found.history, order[None], axis=1).sum(axis=2))
     losses = (np.concatenate([*(part[:-1] for part in curves[:-1]), curves[-1]]) + fixed) / n
-    losses = losses.T.astype(starts.dtype)
+    losses = losses.T.astype(initial.dtype)
     free_poses = _poses(ordered, problem)
-    ends = np.broadcast_to(starts[:1, free:], (len(free_poses), n - free, 7))
+    ends = np.broadcast_to(initial[:1, free:], (len(free_poses), n - free, 7))
     return Result(
         trajectories=jnp.asarray(np.concatenate([free_poses, ends], axis=1)),
         energies=jnp.asarray(losses[:, -1]),
         candidate_history=jnp.asarray(losses[:, :-1]),
-        initial_trajectories=jnp.asarray(starts),
+        initial_trajectories=jnp.asarray(initial),
         # It stays in numpy: under `jax_debug_nans` an array of jax must not hold NaN.
-        history=_history(followed, len(starts), losses.shape[1] - 1, fixed, n).astype(starts.dtype),
+        history=_history(followed, len(initial), losses.shape[1] - 1, fixed, n).astype(initial.dtype),
     )
 
 
@@ -371,7 +370,7 @@ def _run(stage, candidates, fixed=None, waypoints=None, *, shared, config, room,
     bounds = np.array([rows * free, count, blocks, steps[stage]], np.int32)
     given = (R, centroid, waypoint)
     limits = (bounds, R.dtype.type(FIRST_DAMPINGS[stage]), R.dtype.type(config.tolerance))
-    dealt = slice(None)
+    dealt = np.arange(room)
     if device_mesh is not None:
         # The poses are dealt out in turn, so that every device has its share of those that move.
         dealt = np.arange(room).reshape(-1, device_mesh.size).T.ravel()
@@ -387,4 +386,4 @@ def _run(stage, candidates, fixed=None, waypoints=None, *, shared, config, room,
     history = np.where(np.isfinite(history), history, np.inf)
     ended = [part[: rows * free].reshape(rows, free, *part.shape[1:]) for part in (R, centroid)]
     energies = history[:, : rows * free].reshape(len(history), rows, free)
-    return Candidates(*ended, energies[-1], energies), history[-1, rows * free : count].sum()
+    return Candidates(ended[0], ended[1], energies[-1], energies), history[-1, rows * free : count].sum()

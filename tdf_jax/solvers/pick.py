@@ -92,7 +92,7 @@ def carry(
     reference: Reference,
     key: PRNGKeyArray,
     *,
-    goal: Float[Array, "7"] | None = None,
+    goal: Float[Array | np.ndarray, "7"] | None = None,
     fix_last: bool = True,
     config: CarryConfig = CarryConfig(),
     progress: Callable[[int, Float[np.ndarray, " candidates"]], None] | None = None,
@@ -140,7 +140,7 @@ def carry(
     picks = jnp.concatenate([result.trajectories[:, 0], result.initial_trajectories[:, 0]])
     trajectories = carry_to_picks(reference.trajectory, picks, goal)
     count = len(result.trajectories)
-    residual = pick_residual(result.loss, pick.descriptors[0]) if result.finite.any() else np.nan
+    residual = pick_residual(float(result.loss), pick.descriptors[0]) if result.finite.any() else np.nan
     return dataclasses.replace(
         result,
         trajectories=trajectories[:count],

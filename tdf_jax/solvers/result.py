@@ -60,14 +60,14 @@ class Result:
             `tdf_jax.recognition`; a scalar, set by `imitate` with shipped weights.
     """
 
-    trajectories: Float[Array, "*batch candidates poses 7"]
-    energies: Float[Array, "*batch candidates"]
-    candidate_history: Float[Array, "*batch candidates steps"]
-    initial_trajectories: Float[Array, "*batch starts poses 7"]
-    history: Float[Array, "*batch starts steps"]
-    residual: Float[Array, "*batch"] = dataclasses.field(default_factory=_unknown)
-    confidence: Float[Array, "*batch"] = dataclasses.field(default_factory=_unknown)
-    recognised: Float[Array, "*batch"] = dataclasses.field(default_factory=_unknown)
+    trajectories: Float[Array | np.ndarray, "*batch candidates poses 7"]
+    energies: Float[Array | np.ndarray, "*batch candidates"]
+    candidate_history: Float[Array | np.ndarray, "*batch candidates steps"]
+    initial_trajectories: Float[Array | np.ndarray, "*batch starts poses 7"]
+    history: Float[Array | np.ndarray, "*batch starts steps"]
+    residual: Float[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_unknown)
+    confidence: Float[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_unknown)
+    recognised: Float[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_unknown)
 
     @property
     def finite(self) -> Bool[Array | np.ndarray, "*batch candidates"]:
@@ -98,7 +98,7 @@ class Result:
         return Trajectory(jnp.take_along_axis(jnp.asarray(self.trajectories), index, axis=-3)[..., 0, :, :])
 
     @property
-    def loss(self) -> float | Float[Array, "*batch"]:
+    def loss(self) -> float | Float[Array | np.ndarray, "*batch"]:
         """Energy of the best trajectory; a Python float outside a trace, unless there is a batch."""
         loss = jnp.take_along_axis(jnp.asarray(self.energies), jnp.asarray(self.best)[..., None], axis=-1)[..., 0]
         return loss if checks.traced(loss) or loss.ndim else float(loss)
@@ -127,14 +127,15 @@ class Result:
         return "\n".join(["Result", *(f"  {name:<{width}}  {value}" for name, value in rows.items())])
 
     def _repr_html_(self) -> str:
+        left = "style='text-align:left'"
         rows = "".join(
-            f"<tr><th style='text-align:left'>{html.escape(name)}</th><td style='text-align:left'>{html.escape(value)}</td></tr>"
+            f"<tr><th {left}>{html.escape(name)}</th><td {left}>{html.escape(value)}</td></tr>"
             for name, value in self._summary().items()
         )
         return f"<table><caption>Result</caption>{rows}</table>"
 
     def _summary(self) -> dict[str, str]:
-        """What `repr` prints: the pick pose, energies, confidence and distinct solutions; shapes of what is traced or a batch."""
+        """Rows that `repr` prints; of traced values and batches, shapes only."""
         shapes = {"trajectories": str(np.shape(self.trajectories)), "starts": str(np.shape(self.history)[:-1])}
         if checks.traced(self.energies, self.trajectories) or np.ndim(self.energies) != 1:
             return shapes
@@ -169,4 +170,4 @@ def _distinct_picks(result: Result) -> int:
     # Display may look at what comes after the solvers: tests/test_layout.py lists this import.
     from tdf_jax.uncertainty.modes import cluster_poses
 
-    return len(cluster_poses(np.asarray(result.trajectories)[:, 0], np.asarray(result.energies)))
+    return len(cluster_poses(result.trajectories[:, 0], result.energies))
