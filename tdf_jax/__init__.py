@@ -1,4 +1,14 @@
-"""Imitate a demonstrated pick-and-place trajectory on new objects: Trajectory Descriptor Fields in JAX."""
+"""Imitate a demonstrated pick-and-place trajectory on new objects: Trajectory Descriptor Fields in JAX.
+
+    mesh or cloud file --load_mesh, load_points, sample_surface--> points
+    points --encode--> DescriptorField
+    Demonstration (points, trajectory, query points) --describe--> Reference
+    DescriptorField + Reference --carry, solve or optimize--> Result, whose `.trajectory` is the best one
+    Trajectory + obstacles --push_clear--> Trajectory
+
+`imitate` goes the whole way in one call. Lengths are in metres, angles in radians, poses `wxyz_xyz` as in jaxlie, and
+`T_world_query` is the pose of the query frame in the world.
+"""
 
 from tdf_jax._internal.errors import CategoryWarning as CategoryWarning, InputError as InputError
 from tdf_jax.energy.descriptors import (
