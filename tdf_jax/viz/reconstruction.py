@@ -97,7 +97,7 @@ def transfer_figure(panels: Sequence[Panel], title: str = "") -> Figure:
             _draw(_axes(figure, index, 1, 0, ""), pieces, contents[index], edge)
             _name(figure, index, 1, f"{panel.name}\n{panel.error}")
         lines = [Line2D([], [], color=TRUTH, ls=(0, (3, 2))), Line2D([], [], color=ESTIMATE)]
-        words = ["query box at the true place", "estimated; the filled face is +x"]
+        words = ["true query box", "estimated; the filled face is +x"]
         figure.legend(lines, words, loc="lower right", ncols=2, frameon=False, bbox_to_anchor=(1.0, 0.0))
     return figure
 

@@ -207,7 +207,7 @@ def test_tasks_on_real_meshes_are_of_all_paths_and_goals_and_apart_from_the_othe
 
 
 def test_a_negative_index_is_refused(case):
-    with pytest.raises(InputError, match=r"make_task\(\): index is -1; expected 0 or more"):
+    with pytest.raises(InputError, match=r"make_task\(\): index is -1; expected a whole number of at least 0"):
         make_task(case, 0, -1)
 
 
@@ -685,7 +685,7 @@ def test_a_start_that_became_non_finite_spoils_nothing(task):
     )
     # a task that is lost altogether is a failure that can be told
     json.dumps(dataclasses.asdict(lost), allow_nan=False)
-    assert not lost.succeeds(0.05, 30)
+    assert not lost.succeeds(THRESHOLDS["5cm_30deg"])
 
 
 def made(pick=0.0, angle=0.0, *, rest=0.01, method="tdf_jax", **about):
@@ -1083,7 +1083,7 @@ def test_a_damaged_file_is_named(task, model, tmp_path, damage):
     outcomes([lambda: task], model, tmp_path, ("copy",))
     (path,) = tmp_path.iterdir()
     path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(InputError, match=f"{re.escape(str(path))} cannot be read .*delete it: it is computed again"):
+    with pytest.raises(InputError, match=f"{re.escape(str(path))} cannot be read .*delete it, and it is computed again"):
         outcomes([lambda: task], model, tmp_path, ("copy",))
     path.unlink()
     assert len(outcomes([lambda: task], model, tmp_path, ("copy",))) == 1
