@@ -1,7 +1,6 @@
 """Energies that the solver and Adam reach, on pairs of unseen mugs and on the rows of table 1.
 
-All pairs and rows take about 20 minutes on two cores. Computed energies are kept in the file, and a second run computes
-only what is missing.
+Computed energies are kept in the file, and a second run computes only what is missing.
 
     python -m tdf_jax.paper.energy_study --pairs 50
 """
