@@ -16,6 +16,7 @@ from tdf_jax._internal.cache import digest
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.cases import Transfer, random_pose
 from tdf_jax.evaluation.pick_transfer import place_errors, transferred
+from tdf_jax.evaluation.statistics import SUCCESS
 from tdf_jax.networks.model import Model, ModelInfo
 from tdf_jax.networks.occupancy import encode_latent, initialise
 from tdf_jax.solvers.adam import OptimizeConfig
@@ -188,7 +189,7 @@ def transfer_errors(params, config: TrainConfig, transfers: list[Transfer]) -> d
     model = Model(params["network"], config.network, ModelInfo("training", "training", config.points))
     found = transferred(model, transfers, config=TRANSFER, progress=False)
     distance, angle = place_errors(found, transfers)
-    success = np.mean((distance <= 0.02) & (angle <= 20))
+    success = np.mean(SUCCESS.holds(distance, angle))
     values = {"position_cm": 100 * np.median(distance), "rotation_deg": np.median(angle), "success": success}
     return {name: round(float(value), 3) for name, value in values.items()}
 
