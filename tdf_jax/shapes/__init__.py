@@ -1,11 +1,11 @@
-"""Parametric object families with ground truth.
+"""Parametric families of objects with ground truth.
 
 Modules:
     bottle: bottles
     bowl: bowls
     mug: mugs
-    shape: what all generated objects share
-    solid: solids of stacked polygons, their meshes and exact inside tests
+    shape: base class of generated objects
+    solid: parts of solids, their meshes and exact inside tests
 """
 
 from collections.abc import Callable
@@ -21,10 +21,10 @@ class Family(NamedTuple):
     """A category of generated objects.
 
     Attributes:
-        build: parameters -> `Shape`.
-        sample: a numpy generator -> parameters.
-        places: names of the frames every object of it has; the first is where demonstrations pick it.
-        size: of a common one, metres: a mug's height, the diagonal of others.
+        build: makes a `Shape` of its parameters.
+        sample: draws parameters with a numpy generator.
+        places: names of the frames of every object; demonstrations pick the first place.
+        size: size of a common object, metres: the height of a mug, the diagonal of others.
     """
 
     build: Callable

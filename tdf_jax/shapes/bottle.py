@@ -1,7 +1,7 @@
 """Parametric bottles: watertight meshes with ground truth frames and an exact inside test.
 
 Canonical frame: z up along the bottle's axis, a flat bottle's wide side and a handle along x, the origin on the axis at
-half the height. Bottles are solid but for the mouth of an open neck: what sensors see of them is their outside.
+half the height. Bottles are solid except for the mouth of an open neck, because sensors see only their outside.
 """
 
 from dataclasses import dataclass
@@ -10,14 +10,14 @@ import numpy as np
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.symmetry import ROUND
-from tdf_jax.shapes.shape import Clay, Shape, accepted, check_numbers, frame, is_one_body, moulded
-from tdf_jax.shapes.solid import Loft, bar_line, bends_freely, encloses, inset, section, swept, tube_rings
+from tdf_jax.shapes.shape import Shape, Solid, check_dimensions, draw_valid, frame, is_one_body, solid_mesh
+from tdf_jax.shapes.solid import Loft, Tube, bar_line, bends_freely, encloses, inset, section, swept, tube_rings
 
 SHOULDERS = ("arc", "slope")
 
 _TUBE_RINGS = 30  # rings along the handle
-_STEP = 2e-4  # of the height: over which a cap steps out from the neck
-_LEAST_CAP = 0.005  # of the height
+_STEP = 2e-4  # of the height, over which a cap widens from the neck
+_MIN_CAP = 0.005  # of the height
 
 
 @dataclass(frozen=True)
@@ -25,29 +25,29 @@ class BottleParameters:
     """The dimensions of one bottle, in metres unless stated otherwise; the defaults make a common 0.22 m bottle.
 
     Attributes:
-        height: to the top of the cap or the mouth.
-        radius: of the body, along x.
-        aspect: the body's extent along y over that along x, 0.35 (flat) to 1; no unit.
+        height: height of the top of the cap or of the mouth.
+        radius: radius of the body, along x.
+        aspect: the body's extent along y divided by that along x, 0.35 (flat) to 1; no unit.
         squareness: superellipse exponent of the body's cross-section, 2 (round, oval) to 20 (square); no unit.
-        bulge: added to the body's radius at half its height, fading as a parabola; positive is a barrel, negative a
-            waist.
+        bulge: addition to the body's radius at half its height, which falls off as a parabola; positive for a barrel,
+            negative for a waist.
         edge_radius: rounding of the bottom edge.
-        shoulder_bottom: height where the body ends and narrows to the neck.
-        shoulder_top: height where the neck begins.
-        shoulder_style: "arc" (a dome of `shoulder_curve`) or "slope" (S-shaped, as a wine bottle's).
+        shoulder_bottom: height at which the body ends and narrows to the neck.
+        shoulder_top: height at which the neck begins.
+        shoulder_style: "arc" (a dome of `shoulder_curve`) or "slope" (S-shaped, as of a wine bottle).
         shoulder_curve: superellipse exponent of an arc, 1 (straight cone) to 4 (flat top); no unit.
-        neck_radius: where the neck begins.
-        neck_taper: radius of the neck's top over that of its beginning, 0.5 to 1.1; no unit.
-        cap_height: of the cap; 0 for an open mouth.
-        cap_radius: where the cap begins.
-        cap_taper: radius of the cap's top over that of its beginning, 0.3 to 1.1; no unit.
-        mouth_depth: how deep an open mouth is; 0 for a closed top.
-        handle: whether it has one, on the +x side.
-        handle_top: height of the upper attachment; on the body or the neck.
+        neck_radius: radius at the beginning of the neck.
+        neck_taper: radius of the neck's top divided by that of its beginning, 0.5 to 1.1; no unit.
+        cap_height: height of the cap; 0 for an open mouth.
+        cap_radius: radius at the beginning of the cap.
+        cap_taper: radius of the cap's top divided by that of its beginning, 0.3 to 1.1; no unit.
+        mouth_depth: depth of an open mouth; 0 for a closed top.
+        handle: whether there is a handle, on the +x side.
+        handle_top: height of the upper attachment, on the body or the neck.
         handle_bottom: height of the lower attachment.
-        handle_reach: from the wider attachment on the wall to the centre line of the handle's bar.
-        handle_width: of its section, across the plane of symmetry.
-        handle_thickness: of its section, in the plane of symmetry.
+        handle_reach: distance from the wider attachment on the wall to the centre line of the handle's bar.
+        handle_width: width of the handle's section, across the plane of symmetry.
+        handle_thickness: thickness of the handle's section, in the plane of symmetry.
     """
 
     height: float = 0.220
@@ -75,7 +75,7 @@ class BottleParameters:
 
     @property
     def fold(self) -> int:
-        """Symmetry about z: 1 of bottles with a handle, 0 of round ones, 2 of flat and 4 of square ones."""
+        """Symmetry about z: 1 of bottles with a handle, otherwise 0 of round, 2 of flat and 4 of square ones."""
         if self.handle:
             return 1
         if self.aspect < 1:
@@ -85,19 +85,19 @@ class BottleParameters:
 
 @dataclass(frozen=True, eq=False)
 class Bottle(Shape):
-    """One bottle with its ground truth; see `Shape`.
+    """A bottle with its ground truth; see `Shape`.
 
-    Its places lie on the axis: the neck (half way from where the shoulder is as wide as half of body and neck together
-    to the top), the base (at the plane it stands on) and the body (half way up to the shoulder).
+    Its places are on the axis: the neck (midway between the top and the height at which the shoulder's radius is the
+    mean of those of body and neck), the base (in the plane of the base) and the body (at half the shoulder's height).
     """
 
     category = "bottle"
     unitless = ("aspect", "squareness", "shoulder_style", "shoulder_curve", "neck_taper", "cap_taper", "handle")
 
     @staticmethod
-    def clay_of(parameters: BottleParameters) -> Clay:
+    def solid_of(parameters: BottleParameters) -> Solid:
         """The bottle, its handle and its mouth."""
-        return _clay(parameters)
+        return _solid(parameters)
 
 
 def build_bottle(parameters: BottleParameters = BottleParameters()) -> Bottle:
@@ -113,11 +113,11 @@ def build_bottle(parameters: BottleParameters = BottleParameters()) -> Bottle:
         InputError: the dimensions do not make a bottle; the message names the one to change.
     """
     _check(parameters)
-    mesh = moulded(_clay(parameters))
+    mesh = solid_mesh(_solid(parameters))
     if not is_one_body(mesh, handles=int(parameters.handle)):
         raise InputError(
-            f"build_bottle(): the dimensions give no single closed bottle; got {parameters}; expected the neck and handle of a common "
-            "bottle: move them towards the defaults"
+            f"build_bottle(): the dimensions give no single closed bottle; got {parameters}; "
+            "expected the neck and handle of a common bottle: move them towards the defaults"
         )
     half, p = parameters.height / 2, parameters
     neck = (_neck_from(p) + p.height) / 2
@@ -130,15 +130,17 @@ def build_bottle(parameters: BottleParameters = BottleParameters()) -> Bottle:
 
 
 def sample_bottle(rng: np.random.Generator) -> BottleParameters:
-    """Draw the dimensions of a bottle 0.12 to 0.30 m tall: round, flat, square, every shoulder, capped or open, some with a handle.
+    """Draw the dimensions of a bottle 0.12 to 0.30 m tall.
+
+    Bottles are round, flat or square, with every shoulder, capped or open, and some have a handle.
 
     Args:
-        rng: the source of chance; the same state gives the same bottle.
+        rng: random generator; the same state gives the same bottle.
 
     Returns:
         Dimensions that `build_bottle` accepts.
     """
-    return accepted(_draw, _check, rng)  # most draws with a handle ask for one that does not fit
+    return draw_valid(_draw, _check, rng)  # the handle of most draws with one does not fit
 
 
 def _draw(rng: np.random.Generator) -> BottleParameters:
@@ -190,8 +192,8 @@ def _check(p: BottleParameters) -> None:
             raise InputError(f"build_bottle(): {what}; got {p}")
 
     need(p.shoulder_style in SHOULDERS, f"shoulder_style is {p.shoulder_style!r}; expected one of {SHOULDERS}")
-    check_numbers(
-        "build_bottle", p, may_be_zero=("edge_radius", "cap_height", "mouth_depth"), may_be_negative=("bulge",)
+    check_dimensions(
+        "build_bottle()", p, may_be_zero=("edge_radius", "cap_height", "mouth_depth"), may_be_negative=("bulge",)
     )
     need(0.35 <= p.aspect <= 1, f"aspect is {p.aspect}; expected 0.35 to 1")
     need(2 <= p.squareness <= 20, f"squareness is {p.squareness}; expected 2 (round) to 20 (square)")
@@ -204,8 +206,8 @@ def _check(p: BottleParameters) -> None:
     )
     need(p.cap_height <= 0.98 * (p.height - p.shoulder_top), "cap_height must be less than the neck's")
     need(
-        p.cap_height == 0 or p.cap_height > _LEAST_CAP * p.height,
-        f"cap_height must be 0 or more than {_LEAST_CAP} of height",
+        p.cap_height == 0 or p.cap_height > _MIN_CAP * p.height,
+        f"cap_height must be 0 or more than {_MIN_CAP} of height",
     )
     need(abs(p.bulge) < 0.3 * p.radius, "bulge must be less than 0.3 of radius")
     need(p.edge_radius < 0.9 * p.radius * p.aspect, "edge_radius must be less than 0.9 of the smaller radius")
@@ -222,7 +224,7 @@ def _check(p: BottleParameters) -> None:
 
 def _check_handle(p: BottleParameters, need) -> None:
     half = p.height / 2
-    body, tube = _clay(p).joined
+    body, tube = _outline(p), _handle(p)
     need(
         p.handle_top - p.handle_bottom > 3 * p.handle_thickness,
         "handle_top and handle_bottom are too close for the thickness",
@@ -242,7 +244,7 @@ def _check_handle(p: BottleParameters, need) -> None:
 
 
 def _shoulder(p: BottleParameters, share):
-    """How far the shoulder still is from the neck, 1 to 0, at a share of its height."""
+    """Share of the shoulder's narrowing that remains at a share of its height, 1 to 0."""
     if p.shoulder_style == "slope":
         return (1 + np.cos(np.pi * share)) / 2
     return np.maximum(1 - share**p.shoulder_curve, 0) ** (1 / p.shoulder_curve)
@@ -270,7 +272,7 @@ def _wall(p: BottleParameters, level: float) -> float:
 
 
 def _neck_from(p: BottleParameters) -> float:
-    """Level where the shoulder is half way from the body's radius to the neck's."""
+    """Level at which the shoulder's radius is the mean of those of body and neck."""
     share = np.linspace(0, 1, 401)
     return float(
         p.shoulder_bottom + (p.shoulder_top - p.shoulder_bottom) * share[np.argmax(_shoulder(p, share) <= 0.5)]
@@ -290,7 +292,7 @@ def _outline(p: BottleParameters) -> Loft:
         * p.height
     )
     body = (_body(p, levels) - inset(levels, p.edge_radius))[:, None] * unit
-    # Small steps towards the top of a dome, where it is flat.
+    # Steps are small near the top of a dome, where it is flat.
     share = np.sin(np.linspace(0, np.pi / 2, 25))[1:] if p.shoulder_style == "arc" else np.linspace(0, 1, 25)[1:]
     narrowed = p.neck_radius + (p.radius * unit - p.neck_radius) * _shoulder(p, share)[:, None]
     shoulder = p.shoulder_bottom + (p.shoulder_top - p.shoulder_bottom) * share
@@ -305,16 +307,18 @@ def _outline(p: BottleParameters) -> Loft:
     return Loft(np.concatenate(heights) - p.height / 2, np.concatenate(radii))
 
 
-def _clay(p: BottleParameters) -> Clay:
-    joined, hollows = [_outline(p)], []
-    if p.handle:
-        top, bottom = p.handle_top - p.height / 2, p.handle_bottom - p.height / 2
-        x_top, x_bottom = _wall(p, p.handle_top), _wall(p, p.handle_bottom)
-        x_bar = max(x_top, x_bottom) + p.handle_reach
-        radius = 0.6 * min((top - bottom) / 2, p.handle_reach)
-        line = bar_line(x_top, x_bottom, x_bar, top, bottom, radius)
-        joined.append(swept(line, p.handle_thickness, p.handle_width, 2.0, 1.15, _TUBE_RINGS))
-    if p.cap_height == 0 and p.mouth_depth > 0:
-        mouth = np.full(len(section(1.0, 2.0)), 0.75 * min(p.neck_radius, float(_neck(p, p.height))))
-        hollows.append(Loft(np.array([p.height / 2 - p.mouth_depth, p.height]), np.stack([mouth, mouth])))
-    return Clay(tuple(joined), tuple(hollows))
+def _handle(p: BottleParameters) -> Tube:
+    top, bottom = p.handle_top - p.height / 2, p.handle_bottom - p.height / 2
+    x_top, x_bottom = _wall(p, p.handle_top), _wall(p, p.handle_bottom)
+    x_bar = max(x_top, x_bottom) + p.handle_reach
+    radius = 0.6 * min((top - bottom) / 2, p.handle_reach)
+    line = bar_line(x_top, x_bottom, x_bar, top, bottom, radius)
+    return swept(line, p.handle_thickness, p.handle_width, 2.0, 1.15, _TUBE_RINGS)
+
+
+def _solid(p: BottleParameters) -> Solid:
+    parts = (_outline(p), _handle(p)) if p.handle else (_outline(p),)
+    if p.cap_height > 0 or p.mouth_depth == 0:
+        return Solid(parts, ())
+    mouth = np.full(len(section(1.0, 2.0)), 0.75 * min(p.neck_radius, float(_neck(p, p.height))))
+    return Solid(parts, (Loft(np.array([p.height / 2 - p.mouth_depth, p.height]), np.stack([mouth, mouth])),))

@@ -9,11 +9,11 @@ import numpy as np
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.symmetry import ROUND
-from tdf_jax.shapes.shape import Clay, Shape, accepted, check_numbers, frame, is_one_body, moulded
+from tdf_jax.shapes.shape import Shape, Solid, check_dimensions, draw_valid, frame, is_one_body, solid_mesh
 from tdf_jax.shapes.solid import Loft, inset, section
 
 _PROFILE = 60  # points along the side's profile
-_FLARE_FROM = 0.8  # of the side's height: where a flared or drawn-in rim begins
+_FLARE_FROM = 0.8  # of the side's height, at which a flared or drawn-in rim begins
 
 
 @dataclass(frozen=True)
@@ -21,17 +21,19 @@ class BowlParameters:
     """The dimensions of one bowl, in metres unless stated otherwise; the defaults make a common 0.15 m cereal bowl.
 
     Attributes:
-        height: of the bowl, its foot included.
-        radius: of the outer wall at the rim, along x, before `rim_flare`.
-        aspect: extent along y over that along x, 0.4 (oval) to 1; no unit.
+        height: height of the bowl, including its foot.
+        radius: outer radius at the rim, along x, before `rim_flare`.
+        aspect: extent along y divided by that along x, 0.4 (oval) to 1; no unit.
         squareness: superellipse exponent of the cross-section, 2 (round, oval) to 20 (square); no unit.
-        base_radius: of the base, or of the foot, along x.
+        base_radius: radius of the base, or of the foot, along x.
         curve: superellipse exponent of the side's profile, 1 (straight cone), 2 (quarter of an ellipse) to 6 (flat
             floor, upright wall); no unit.
-        rim_flare: how far the uppermost fifth of the side is turned out (positive) or drawn in (negative).
-        wall_thickness: of the wall, across it, along x; an oval's is thinner along y, as its aspect.
-        bottom_thickness: of the floor, above the foot.
-        foot_height: of the ring the bowl stands on; 0 for a flat base.
+        rim_flare: displacement of the rim outwards (positive) or inwards (negative), over the uppermost fifth of the
+            side.
+        wall_thickness: thickness of the wall along x, normal to its profile; an oval's wall is thinner along y by its
+            aspect.
+        bottom_thickness: thickness of the floor, above the foot.
+        foot_height: height of the ring under the base; 0 for a flat base.
         foot_width: radial width of that ring.
         lip_radius: rounding of both edges of the rim; less than half the wall.
     """
@@ -59,19 +61,19 @@ class BowlParameters:
 
 @dataclass(frozen=True, eq=False)
 class Bowl(Shape):
-    """One bowl with its ground truth; see `Shape`.
+    """A bowl with its ground truth; see `Shape`.
 
-    Its places are the rim (origin on top of the wall on the +x side, x outward, z up), the base (on the axis, at the
-    plane it stands on) and the body (on the axis, at half the height).
+    Its places are the rim (origin on top of the wall on the +x side, x outward, z up), the base (on the axis, in the
+    plane of the base) and the body (on the axis, at half the height).
     """
 
     category = "bowl"
     unitless = ("aspect", "squareness", "curve")
 
     @staticmethod
-    def clay_of(parameters: BowlParameters) -> Clay:
+    def solid_of(parameters: BowlParameters) -> Solid:
         """The body, the hollow and the recess of the foot."""
-        return _clay(parameters)
+        return _solid(parameters)
 
 
 def build_bowl(parameters: BowlParameters = BowlParameters()) -> Bowl:
@@ -87,11 +89,11 @@ def build_bowl(parameters: BowlParameters = BowlParameters()) -> Bowl:
         InputError: the dimensions do not make a bowl; the message names the one to change.
     """
     _check(parameters)
-    mesh = moulded(_clay(parameters))
+    mesh = solid_mesh(_solid(parameters))
     if not is_one_body(mesh, handles=0):
         raise InputError(
-            f"build_bowl(): the dimensions give no single closed bowl; got {parameters}; expected the walls of a common bowl: "
-            "move them towards the defaults"
+            f"build_bowl(): the dimensions give no single closed bowl; got {parameters}; "
+            "expected the walls of a common bowl: move them towards the defaults"
         )
     half, p = parameters.height / 2, parameters
     rim = float(_outer(p)[0][-1] + _inner_radius(p, np.array([p.height]))[0]) / 2
@@ -99,15 +101,17 @@ def build_bowl(parameters: BowlParameters = BowlParameters()) -> Bowl:
 
 
 def sample_bowl(rng: np.random.Generator) -> BowlParameters:
-    """Draw the dimensions of a bowl 0.10 to 0.22 m across: shallow to deep, with foot or none, plain, flared or drawn-in rim; some oval, some square.
+    """Draw the dimensions of a bowl 0.10 to 0.22 m wide.
+
+    Bowls are shallow to deep, with or without a foot, with a plain, flared or drawn-in rim; some are oval or square.
 
     Args:
-        rng: the source of chance; the same state gives the same bowl.
+        rng: random generator; the same state gives the same bowl.
 
     Returns:
         Dimensions that `build_bowl` accepts.
     """
-    return accepted(_draw, _check, rng)  # some draws ask for a floor thicker than a shallow bowl has room for
+    return draw_valid(_draw, _check, rng)  # some draws have a floor that is too thick for a shallow bowl
 
 
 def _draw(rng: np.random.Generator) -> BowlParameters:
@@ -144,7 +148,7 @@ def _check(p: BowlParameters) -> None:
         if not truth:
             raise InputError(f"build_bowl(): {what}; got {p}")
 
-    check_numbers("build_bowl", p, may_be_zero=("foot_height", "lip_radius"), may_be_negative=("rim_flare",))
+    check_dimensions("build_bowl()", p, may_be_zero=("foot_height", "lip_radius"), may_be_negative=("rim_flare",))
     need(0.4 <= p.aspect <= 1, f"aspect is {p.aspect}; expected 0.4 to 1")
     need(2 <= p.squareness <= 20, f"squareness is {p.squareness}; expected 2 (round) to 20 (square)")
     need(1 <= p.curve <= 6, f"curve is {p.curve}; expected 1 to 6")
@@ -165,7 +169,7 @@ def _check(p: BowlParameters) -> None:
 
 def _outer(p: BowlParameters) -> tuple[np.ndarray, np.ndarray]:
     """Radius along x and height above the base, upwards, of the side above the foot, before edges are rounded."""
-    # Even turning of the profile: steps are small where it is flat, near the base, and heights still rise.
+    # Even angles along the profile make small steps near the base, where it is flat, and heights rise everywhere.
     s = 1 - np.cos(np.linspace(0, np.pi / 2, _PROFILE))
     radius = p.base_radius + (p.radius - p.base_radius) * (1 - (1 - s) ** p.curve) ** (1 / p.curve)
     radius = radius + p.rim_flare * (np.maximum(s - _FLARE_FROM, 0) / (1 - _FLARE_FROM)) ** 2
@@ -173,12 +177,12 @@ def _outer(p: BowlParameters) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _inner_radius(p: BowlParameters, levels: np.ndarray) -> np.ndarray:
-    """Radius along x of the hollow at levels above the base: the side moved inwards by the wall, across it."""
+    """Radius along x of the hollow at levels above the base: the side, offset inwards by the thickness of the wall."""
     radius, height = _outer(p)
     along = np.stack([np.gradient(radius), np.gradient(height)])
     along /= np.linalg.norm(along, axis=0)
     inner_radius, inner_height = radius - p.wall_thickness * along[1], height + p.wall_thickness * along[0]
-    # Of a side that leans in it ends below the rim: straight on from there.
+    # The offset of a side that leans inwards ends below the rim, and is extended straight from there.
     further = max(height[-1] - inner_height[-1], 0) / along[1, -1] + p.wall_thickness
     inner_radius = np.append(inner_radius, inner_radius[-1] + further * along[0, -1])
     inner_height = np.append(inner_height, inner_height[-1] + further * along[1, -1])
@@ -186,7 +190,7 @@ def _inner_radius(p: BowlParameters, levels: np.ndarray) -> np.ndarray:
     return np.interp(levels, inner_height[order], inner_radius[order])
 
 
-def _clay(p: BowlParameters) -> Clay:
+def _solid(p: BowlParameters) -> Solid:
     unit, floor = section(p.aspect, p.squareness), p.foot_height + p.bottom_thickness
     quarter = 1 - np.cos(np.linspace(0, np.pi / 2, 6))
     radius, height = _outer(p)
@@ -204,9 +208,9 @@ def _clay(p: BowlParameters) -> Clay:
         * p.height
     )
     inner = _inner_radius(p, levels_in) + inset(p.height - levels_in, p.lip_radius)
-    above = np.append(levels_in, 1.5 * p.height)  # cut well past the rim, so no two faces coincide
+    above = np.append(levels_in, 1.5 * p.height)  # the cut extends well beyond the rim, so that no two faces coincide
     hollows = [Loft(above - p.height / 2, np.append(inner, inner[-1])[:, None] * unit)]
     if p.foot_height > 0:
         recess = (p.base_radius - p.foot_width) * unit
         hollows.append(Loft(np.array([-p.height, p.foot_height - p.height / 2]), np.stack([recess, recess])))
-    return Clay((Loft(levels - p.height / 2, outer[:, None] * unit),), tuple(hollows))
+    return Solid((Loft(levels - p.height / 2, outer[:, None] * unit),), tuple(hollows))

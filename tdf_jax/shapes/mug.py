@@ -1,8 +1,8 @@
 """Parametric mugs: watertight meshes with ground truth frames and an exact inside test.
 
 Canonical frame: z up along the mug's axis, the handle along +x, the origin on the axis at half the body's height.
-Every surface is flat between neighbouring rings, so `Mug.contains` decides by the very planes of the mesh: training
-labels and surface samples agree to rounding (3e-5 m along a flared handle), which no smooth formula would give.
+Every surface is flat between neighbouring rings, and `Mug.contains` tests the planes of the mesh. Training labels and
+surface samples therefore agree to rounding, which a smooth formula would not achieve.
 """
 
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from tdf_jax._internal.errors import InputError
-from tdf_jax.shapes.shape import Clay, Shape, accepted, check_numbers, frame, is_one_body, moulded
-from tdf_jax.shapes.solid import Solid, Tube, bar_line, bends_freely, in_solid, inset, polygon, swept, tube_rings
+from tdf_jax.shapes.shape import Shape, Solid, check_dimensions, draw_valid, frame, is_one_body, solid_mesh
+from tdf_jax.shapes.solid import Frusta, Tube, bar_line, bends_freely, in_frusta, inset, polygon, swept, tube_rings
 
 HANDLE_STYLES = ("d", "ring", "ear", "square")
 
@@ -26,13 +26,14 @@ class MugParameters:
     """The dimensions of one mug, in metres unless stated otherwise; the defaults make a common 0.10 m mug.
 
     Attributes:
-        height: of the body.
-        top_radius: outer radius at the rim; for square mugs half the side.
+        height: height of the body.
+        top_radius: outer radius at the rim; of square mugs half the side.
         bottom_radius: outer radius at the bottom, before the edge is rounded.
-        bulge: added to the radius at half height, fading as a parabola; positive is a barrel, negative a waist.
+        bulge: addition to the radius at half height, which falls off as a parabola; positive for a barrel, negative for
+            a waist.
         squareness: superellipse exponent of the body's cross-section, 2 (round) to 20 (square); no unit.
-        wall_thickness: of the body's wall.
-        bottom_thickness: of the floor, above the recess of the foot.
+        wall_thickness: thickness of the body's wall.
+        bottom_thickness: thickness of the floor, above the recess of the foot.
         edge_radius: rounding of the outer bottom edge.
         foot_height: depth of the recess inside the foot ring; 0 for a flat bottom.
         foot_width: radial width of the foot ring.
@@ -41,11 +42,11 @@ class MugParameters:
             "square" (straight bar and arms).
         handle_top: height of the upper attachment above the bottom.
         handle_bottom: height of the lower attachment above the bottom.
-        handle_reach: from the wider attachment on the wall to the centre line of the handle's bar.
-        handle_width: of the tube's section, across the mug's plane of symmetry.
-        handle_thickness: of the tube's section, in the mug's plane of symmetry.
+        handle_reach: distance from the wider attachment on the wall to the centre line of the handle's bar.
+        handle_width: width of the tube's section, across the mug's plane of symmetry.
+        handle_thickness: thickness of the tube's section, in the mug's plane of symmetry.
         handle_squareness: superellipse exponent of the tube's section, 2 (ellipse) to 20 (rectangle); no unit.
-        handle_flare: size of the tube's section at the wall over its size at the grip, 1 to 2; no unit.
+        handle_flare: size of the tube's section at the wall divided by its size at the grip, 1 to 2; no unit.
     """
 
     height: float = 0.100
@@ -70,42 +71,42 @@ class MugParameters:
 
     @property
     def fold(self) -> int:
-        """Symmetry about z, 1: the handle tells all sides apart."""
+        """Symmetry about z: 1, because the handle distinguishes all sides."""
         return 1
 
 
 @dataclass(frozen=True, eq=False)
 class Mug(Shape):
-    """One mug with its ground truth; see `Shape`. Its places are the handle, the rim and the base."""
+    """A mug with its ground truth; see `Shape`. Its places are the handle, the rim and the base."""
 
     category = "mug"
     unitless = ("squareness", "handle_style", "handle_squareness", "handle_flare")
 
     @property
     def handle_frame(self) -> Float[np.ndarray, "4 4"]:
-        """Origin on the handle's centre line half way between the attachments, x outward, z up."""
+        """Pose with its origin on the handle's centre line midway between the attachments, x outward, z up."""
         return self.frames["handle"]
 
     @property
     def rim_frame(self) -> Float[np.ndarray, "4 4"]:
-        """Origin on top of the rim on the side opposite to the handle, x outward (object -x), z up."""
+        """Pose with its origin on top of the rim opposite to the handle, x outward (object -x), z up."""
         return self.frames["rim"]
 
     @property
     def base_frame(self) -> Float[np.ndarray, "4 4"]:
-        """Origin on the axis at the plane the mug stands on, x towards the handle, z up."""
+        """Pose with its origin on the axis in the plane of the base, x towards the handle, z up."""
         return self.frames["base"]
 
     @staticmethod
-    def clay_of(parameters: MugParameters) -> Clay:
+    def solid_of(parameters: MugParameters) -> Solid:
         """The body and the handle, the cavity and the recess of the foot."""
-        return _clay(parameters)
+        return _solid(parameters)
 
     def landmarks(self) -> Float[np.ndarray, "landmarks 3"]:
-        """Points that correspond from mug to mug, metres, object frame: as many on every mug, in the same order.
+        """Points that correspond on all mugs, (landmarks, 3), metres, object frame.
 
-        Along the handle at even shares of its centre line's length, on its four sides (inner, outer, left, right); on
-        the outer wall at even shares of the height, at even angles.
+        They are on the four sides of the handle (inner, outer, left, right) at even shares of its centre line's length,
+        and on the outer wall at even shares of the height and even angles.
         """
         p = self.parameters
         line = _even(_centre_line(p), _LANDMARKS_ALONG)
@@ -138,14 +139,13 @@ def build_mug(parameters: MugParameters = MugParameters()) -> Mug:
         InputError: the dimensions do not make a mug; the message names the one to change.
     """
     _check(parameters)
-    clay = _clay(parameters)
-    mesh = moulded(clay)
+    mesh = solid_mesh(_solid(parameters))
     if not is_one_body(mesh, handles=1):
         raise InputError(
             f"build_mug(): the dimensions give no single closed cup with one handle; got {parameters}; "
             "expected walls and handle of a common mug: move them towards the defaults"
         )
-    grip = _grip(clay.joined[1], parameters)
+    grip = _grip(_tube(parameters), parameters)
     rim = parameters.top_radius - parameters.wall_thickness / 2
     half = parameters.height / 2
     return Mug(
@@ -157,12 +157,12 @@ def sample_mug(rng: np.random.Generator) -> MugParameters:
     """Draw the dimensions of a mug 0.07 to 0.13 m tall: straight, tapered, barrel, waisted, square, every handle.
 
     Args:
-        rng: the source of chance; the same state gives the same mug.
+        rng: random generator; the same state gives the same mug.
 
     Returns:
         Dimensions that `build_mug` accepts.
     """
-    return accepted(_draw, _check, rng)  # about one draw in ten asks for a handle that does not fit its body
+    return draw_valid(_draw, _check, rng)  # the handle of about one draw in ten does not fit its body
 
 
 def _draw(rng: np.random.Generator) -> MugParameters:
@@ -209,7 +209,7 @@ def _check(parameters: MugParameters) -> None:
 
     p = parameters
     need(p.handle_style in HANDLE_STYLES, f"handle_style is {p.handle_style!r}; expected one of {HANDLE_STYLES}")
-    check_numbers("build_mug", p, may_be_zero=_MAY_BE_ZERO, may_be_negative=("bulge",))
+    check_dimensions("build_mug()", p, may_be_zero=_MAY_BE_ZERO, may_be_negative=("bulge",))
     for name in ("squareness", "handle_squareness"):
         need(2 <= getattr(p, name) <= 20, f"{name} is {getattr(p, name)}; expected 2 (round) to 20 (square)")
     need(1 <= p.handle_flare <= 2, f"handle_flare is {p.handle_flare}; expected 1 to 2")
@@ -234,10 +234,10 @@ def _check(parameters: MugParameters) -> None:
 
 
 def _check_handle(p: MugParameters, need) -> None:
-    outer, tube = _clay(p).joined
+    outer, tube = _body(p), _tube(p)
     rings = tube_rings(tube)
     need(rings[..., 2].min() > -p.height / 2, "the handle hangs below the bottom: raise handle_bottom")
-    buried = in_solid(outer, np.concatenate([rings[0], rings[-1]])).all()
+    buried = in_frusta(outer, np.concatenate([rings[0], rings[-1]])).all()
     need(buried, "the handle does not end inside the body: move its attachments away from the rounded edge")
     need(bends_freely(tube), "the handle bends more tightly than its thickness allows: thin it or move it out")
     gap = tube.line[:, 0] - p.handle_thickness * tube.scales / 2 - _wall(p, tube.line[:, 1] + p.height / 2)
@@ -252,33 +252,36 @@ def _wall(p: MugParameters, level):
 
 
 def _inner_edge(p: MugParameters) -> float:
-    """Rounding of the cavity's floor: concentric with the outer edge, so the corner is never thinner than the wall."""
+    """Rounding of the cavity's floor, concentric with the outer edge, so that the wall is nowhere thinner there."""
     return max(p.edge_radius - p.wall_thickness, p.wall_thickness / 2)
 
 
 def _levels(p: MugParameters, low: float, high: float, low_radius: float, high_radius: float) -> np.ndarray:
-    """Levels for the rings of a profile: close together along both roundings."""
+    """Levels of a profile's rings, which are close together along both roundings."""
     quarter = 1 - np.cos(np.linspace(0, np.pi / 2, 6))
     middle = np.linspace(low + low_radius, high - high_radius, 10)
     levels = np.concatenate([low + low_radius * quarter, middle, high - high_radius * quarter])
-    return np.unique(np.round(levels / p.height, 9)) * p.height  # one level where parts meet
+    return np.unique(np.round(levels / p.height, 9)) * p.height  # one level, not two that rounding separates
 
 
-def _clay(p: MugParameters) -> Clay:
-    floor = p.foot_height + p.bottom_thickness
+def _body(p: MugParameters) -> Frusta:
     levels = _levels(p, 0.0, p.height, p.edge_radius, p.lip_radius)
     radii = _wall(p, levels) - inset(levels, p.edge_radius) - inset(p.height - levels, p.lip_radius)
-    outer = Solid(levels - p.height / 2, radii, p.squareness)
+    return Frusta(levels - p.height / 2, radii, p.squareness)
+
+
+def _solid(p: MugParameters) -> Solid:
+    floor = p.foot_height + p.bottom_thickness
     levels = _levels(p, floor, p.height, _inner_edge(p), p.lip_radius)
     radii = _wall(p, levels) - p.wall_thickness
     radii = radii - inset(levels - floor, _inner_edge(p)) + inset(p.height - levels, p.lip_radius)
-    above = np.append(levels, 1.5 * p.height)  # cut well past the rim, so no two faces coincide
-    cavity = Solid(above - p.height / 2, np.append(radii, radii[-1]), p.squareness)
+    above = np.append(levels, 1.5 * p.height)  # the cut extends well beyond the rim, so that no two faces coincide
+    cavity = Frusta(above - p.height / 2, np.append(radii, radii[-1]), p.squareness)
     if p.foot_height == 0:
-        return Clay((outer, _tube(p)), (cavity,))
+        return Solid((_body(p), _tube(p)), (cavity,))
     inner = p.bottom_radius - p.edge_radius - p.foot_width
-    recess = Solid(np.array([-p.height, p.foot_height - p.height / 2]), np.array([inner, inner]), p.squareness)
-    return Clay((outer, _tube(p)), (cavity, recess))
+    recess = Frusta(np.array([-p.height, p.foot_height - p.height / 2]), np.array([inner, inner]), p.squareness)
+    return Solid((_body(p), _tube(p)), (cavity, recess))
 
 
 def _tube(p: MugParameters) -> Tube:
@@ -296,7 +299,7 @@ def _centre_line(p: MugParameters) -> np.ndarray:
         return bar_line(x_top, x_bottom, x_bar, middle + half, middle - half, radius)
     t = np.linspace(0, 1, 160)
     if p.handle_style == "ring":
-        centre = 0.35  # of the reach; the ellipse crosses the wall past its widest height
+        centre = 0.35  # of the reach; the ellipse intersects the wall beyond its widest height
         angle = (1 - 2 * t) * np.arccos(-centre / (1 - centre))
         out, up = centre + (1 - centre) * np.cos(angle), np.sin(angle) / np.sin(angle[0])
     else:

@@ -1,40 +1,41 @@
-"""What all generated objects share: a mesh with ground truth, an exact inside test, frames of places, a symmetry."""
+"""Base class of generated objects: a mesh with ground truth, an exact inside test, frames of places, a symmetry."""
 
 import dataclasses
 from abc import ABC, abstractmethod
 from functools import cached_property
-from numbers import Real
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from tdf_jax._internal import checks
+from tdf_jax._internal.deprecation import warn
 from tdf_jax._internal.errors import InputError
-from tdf_jax.shapes.solid import Part, encloses, rings, skin
+from tdf_jax.shapes.solid import Part, closed_mesh, encloses, rings
 
 if TYPE_CHECKING:
     import trimesh
 
 
-class Clay(NamedTuple):
-    """Parts that are joined, and hollows that are cut out of them after."""
+class Solid(NamedTuple):
+    """A union of parts, minus hollows that are cut out of it afterwards."""
 
-    joined: tuple[Part, ...]
+    parts: tuple[Part, ...]
     hollows: tuple[Part, ...]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Shape(ABC):
-    """One generated object; its canonical frame has z up along its axis and the origin on it, at half the body's height.
+    """A generated object. Its canonical frame has z up along its axis and its origin there, at half the body's height.
 
     Attributes:
-        mesh: watertight, normals outward, metres; the clay only, cavities are open.
-        parameters: what it was built from; lengths in metres.
-        frames: T_object_frame of its semantic places by name, 4x4, metres.
+        mesh: watertight mesh of the material, metres, with outward normals; cavities are open.
+        parameters: dimensions of the object; lengths in metres.
+        frames: poses T_object_frame of its semantic places by name, (4, 4), metres.
     """
 
     category: ClassVar[str]
-    unitless: ClassVar[tuple[str, ...]]  # parameters that are no lengths
+    unitless: ClassVar[tuple[str, ...]]  # parameters that are not lengths
 
     mesh: "trimesh.Trimesh"
     parameters: Any
@@ -42,12 +43,12 @@ class Shape(ABC):
 
     @property
     def fold(self) -> int:
-        """Its symmetry about z: 1 none, 2 half turns, 4 quarters, 0 any turn leave it as it is (`tdf_jax.geometry.symmetry`)."""
+        """Symmetry about z (`tdf_jax.geometry.symmetry`): 1 none, 2 half turns, 4 quarter turns, 0 all turns."""
         return self.parameters.fold
 
     @property
     def height(self) -> float:
-        """Of the body, metres."""
+        """Height of the body, metres."""
         return self.parameters.height
 
     @property
@@ -57,22 +58,28 @@ class Shape(ABC):
 
     @staticmethod
     @abstractmethod
-    def clay_of(parameters) -> Clay:
-        """The parts of an object of these parameters."""
+    def solid_of(parameters) -> Solid:
+        """Parts and hollows of an object of these dimensions."""
 
     @cached_property
-    def clay(self) -> Clay:
-        """Its parts."""
-        return self.clay_of(self.parameters)
+    def solid(self) -> Solid:
+        """Parts and hollows of the object."""
+        return self.solid_of(self.parameters)
+
+    @property
+    def clay(self) -> Solid:
+        """Former name of `solid`."""
+        warn(f"{type(self).__name__}.clay", f"{type(self).__name__}.solid")
+        return self.solid
 
     def contains(self, points: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, " points"]:
-        """Tell which points lie in the clay, by the planes of the mesh (no ray casting).
+        """Which points are inside the object's material, by the planes of the mesh (no ray casting).
 
         Args:
-            points: (points, 3), metres, object frame.
+            points: points, (points, 3), metres, object frame.
 
         Returns:
-            (points,) True inside.
+            True inside, (points,).
 
         Raises:
             InputError: the points are not (points, 3), or not finite.
@@ -82,27 +89,27 @@ class Shape(ABC):
             raise InputError(f"{name}.contains(): points have shape {points.shape}; expected (points, 3)")
         if not np.isfinite(points).all():
             raise InputError(
-                f"{name}.contains(): points hold NaN or infinite numbers; expected finite metres; remove them"
+                f"{name}.contains(): points have NaN or infinite coordinates; expected finite metres. Remove them"
             )
-        clay = np.any([encloses(part, points) for part in self.clay.joined], axis=0)
-        for hollow in self.clay.hollows:
-            clay &= ~encloses(hollow, points)
-        return clay
+        inside = np.any([encloses(part, points) for part in self.solid.parts], axis=0)
+        for hollow in self.solid.hollows:
+            inside &= ~encloses(hollow, points)
+        return inside
 
 
-def moulded(clay: Clay) -> "trimesh.Trimesh":
-    """The mesh of parts; whether it is one closed body is for the caller to check."""
+def solid_mesh(solid: Solid) -> "trimesh.Trimesh":
+    """Mesh of a solid; the caller checks whether it is one closed body."""
     import trimesh
 
-    fast = {"engine": "manifold", "check_volume": False}  # the parts are closed by construction; the result is checked
-    joined, hollows = ([skin(rings(part)) for part in parts] for parts in clay)
-    mesh = trimesh.boolean.union(joined, **fast) if len(joined) > 1 else joined[0]
-    # Hollows are cut after everything is joined: nothing of a handle is left inside them.
+    fast = {"engine": "manifold", "check_volume": False}  # parts are closed by construction, and the result is checked
+    parts, hollows = ([closed_mesh(rings(part)) for part in group] for group in solid)
+    mesh = trimesh.boolean.union(parts, **fast) if len(parts) > 1 else parts[0]
+    # Hollows are cut after the union, so that no piece of a handle remains inside them.
     return trimesh.boolean.difference([mesh, *hollows], **fast) if hollows else mesh
 
 
 def is_one_body(mesh: "trimesh.Trimesh", handles: int) -> bool:
-    """Whether a mesh is closed, in one piece, and has so many holes to put a finger through."""
+    """Whether a mesh is closed, in one piece, and has this number of handles (its genus)."""
     return mesh.is_volume and mesh.euler_number == 2 - 2 * handles and mesh.body_count == 1
 
 
@@ -110,8 +117,8 @@ def scaled(shape: Shape, factor: float) -> Shape:
     """Scale an object uniformly about the origin: mesh, frames and parameters.
 
     Args:
-        shape: the object.
-        factor: positive, no unit.
+        shape: object to scale.
+        factor: positive factor, no unit.
 
     Returns:
         A new object.
@@ -119,8 +126,7 @@ def scaled(shape: Shape, factor: float) -> Shape:
     Raises:
         InputError: the factor is not positive and finite.
     """
-    if not (np.isfinite(factor) and factor > 0):
-        raise InputError(f"scaled(): factor is {factor}; expected a positive number")
+    checks.positive("scaled()", "factor", factor)
     lengths = [field.name for field in dataclasses.fields(shape.parameters) if field.name not in shape.unitless]
     parameters = dataclasses.replace(
         shape.parameters, **{name: getattr(shape.parameters, name) * factor for name in lengths}
@@ -131,8 +137,8 @@ def scaled(shape: Shape, factor: float) -> Shape:
     return dataclasses.replace(shape, mesh=shape.mesh.copy().apply_scale(factor), parameters=parameters, frames=frames)
 
 
-def accepted(draw, check, rng: np.random.Generator):
-    """The first drawn parameters that a check does not refuse."""
+def draw_valid(draw, check, rng: np.random.Generator):
+    """The first drawn parameters that a check accepts."""
     while True:
         parameters = draw(rng)
         try:
@@ -149,20 +155,21 @@ def frame(x: float, z: float, outward: float = 1.0) -> Float[np.ndarray, "4 4"]:
     return T
 
 
-def check_numbers(function: str, parameters, *, may_be_zero: tuple[str, ...], may_be_negative: tuple[str, ...]) -> None:
-    """Raise InputError unless all parameters but names are finite numbers of the right sign."""
+def check_dimensions(
+    function: str, parameters, *, may_be_zero: tuple[str, ...], may_be_negative: tuple[str, ...]
+) -> None:
+    """Raise InputError unless all dimensions are finite and of the right sign, and flags are True or False."""
     for field in dataclasses.fields(parameters):
         name, value = field.name, getattr(parameters, field.name)
-        if field.type is str:
-            continue
-        wrong = None
-        if field.type is bool:
-            wrong = None if isinstance(value, bool) else f"{name} is {value!r}; expected True or False"
-        elif not (isinstance(value, Real) and np.isfinite(value)):
-            wrong = f"{name} is {value!r}; expected a finite number"
-        elif not (value > 0 or name in may_be_zero or name in may_be_negative):
-            wrong = f"{name} is {value}; expected a positive number"
-        elif not (value >= 0 or name in may_be_negative):
-            wrong = f"{name} is {value}; expected zero or a positive number"
-        if wrong:
-            raise InputError(f"{function}(): {wrong}; got {parameters}")
+        try:
+            if field.type is bool:
+                if not isinstance(value, bool):
+                    raise InputError(f"{function}: {name} is {value!r}; expected True or False")
+            elif name in may_be_negative:
+                checks.number(function, name, value)
+            elif name in may_be_zero:
+                checks.number(function, name, value, 0)
+            elif field.type is not str:
+                checks.positive(function, name, value)
+        except InputError as error:
+            raise InputError(f"{error}; got {parameters}") from None

@@ -1,4 +1,4 @@
-"""Solids made of stacked polygons, about an axis or swept along a line: their meshes and exact inside tests."""
+"""Parts of solids: polygons stacked about an axis or swept along a line, their meshes and exact inside tests."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -11,8 +11,14 @@ _AROUND = 64  # polygon corners around the body; a multiple of 8, so a square mu
 _TUBE_AROUND = 16  # polygon corners around the handle's tube
 
 
-class Solid(NamedTuple):
-    """A polygon of unit size (see `polygon`) scaled by `radii` at `heights`, flat in between."""
+class Frusta(NamedTuple):
+    """Stacked frusta: the unit polygon (see `polygon`) scaled by `radii` at `heights`, with flat sides in between.
+
+    Attributes:
+        heights: rising heights of the polygons, (rings,).
+        radii: their radii, (rings,).
+        squareness: superellipse exponent of the polygon.
+    """
 
     heights: np.ndarray
     radii: np.ndarray
@@ -20,16 +26,26 @@ class Solid(NamedTuple):
 
 
 class Loft(NamedTuple):
-    """Polygons about the z axis, corners at even angles and at `radii` (rings, corners) from it, straight between `heights` (rings,)."""
+    """Stacked polygons about the z axis, with straight edges in between.
+
+    Attributes:
+        heights: rising heights of the polygons, (rings,).
+        radii: distances of their corners from the axis, at even angles, (rings, corners).
+    """
 
     heights: np.ndarray
     radii: np.ndarray
 
 
 class Tube(NamedTuple):
-    """A section swept along `line` (rings, 2) in the x-z plane, cut at each ring along its mitre (rings, 2).
+    """A section swept along a line in the x-z plane.
 
-    The section is the unit polygon times `section` = half (thickness, width), and times `scales` (rings,).
+    Attributes:
+        line: centre line, (rings, 2).
+        mitres: directions along which the section is cut at every ring, (rings, 2).
+        scales: factors on the section, (rings,).
+        section: half of thickness and width, (2,), a factor on the unit polygon.
+        squareness: superellipse exponent of the polygon.
     """
 
     line: np.ndarray
@@ -39,17 +55,29 @@ class Tube(NamedTuple):
     squareness: float
 
 
-Part = Solid | Loft | Tube
+Part = Frusta | Loft | Tube
 
 
 def encloses(part: Part, points: np.ndarray) -> np.ndarray:
-    """Which points (points, 3) lie in a part."""
-    return {Solid: in_solid, Loft: in_loft, Tube: in_tube}[type(part)](part, points)
+    """Which points (points, 3) are inside a part."""
+    match part:
+        case Frusta():
+            return in_frusta(part, points)
+        case Loft():
+            return in_loft(part, points)
+        case Tube():
+            return in_tube(part, points)
 
 
 def rings(part: Part) -> np.ndarray:
     """The corners (rings, corners, 3) of a part."""
-    return {Solid: solid_rings, Loft: loft_rings, Tube: tube_rings}[type(part)](part)
+    match part:
+        case Frusta():
+            return frusta_rings(part)
+        case Loft():
+            return loft_rings(part)
+        case Tube():
+            return tube_rings(part)
 
 
 def section(aspect: float, exponent: float) -> np.ndarray:
@@ -66,31 +94,31 @@ def polygon(exponent: float, count: int) -> np.ndarray:
 
 
 def _gauge(flat: np.ndarray, exponent: float, count: int) -> np.ndarray:
-    """How much the polygon must grow to reach each point of `flat` (points, 2): 1 on its edges, as in the mesh."""
+    """Factor on the polygon at which it reaches each point of `flat` (points, 2): 1 on its edges, as in the mesh."""
     corners = polygon(exponent, count)
     edges = np.linalg.solve(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1), np.ones((count, 2, 1)))[..., 0]
     sector = np.floor(np.arctan2(flat[:, 1], flat[:, 0]) * (count / (2 * np.pi))).astype(int) % count
     return np.sum(edges[sector] * flat, axis=1)
 
 
-def in_solid(solid: Solid, points: np.ndarray) -> np.ndarray:
-    """Which points (points, 3) lie in a turned solid."""
-    radius = np.interp(points[:, 2], solid.heights, solid.radii, left=-1.0, right=-1.0)
-    return _gauge(points[:, :2], solid.squareness, _AROUND) <= radius
+def in_frusta(frusta: Frusta, points: np.ndarray) -> np.ndarray:
+    """Which points (points, 3) are inside stacked frusta."""
+    radius = np.interp(points[:, 2], frusta.heights, frusta.radii, left=-1.0, right=-1.0)
+    return _gauge(points[:, :2], frusta.squareness, _AROUND) <= radius
 
 
-def solid_rings(solid: Solid) -> np.ndarray:
-    """The corners (rings, corners, 3) of a turned solid, upwards."""
-    rings = solid.radii[:, None, None] * polygon(solid.squareness, _AROUND)
-    heights = np.broadcast_to(solid.heights[:, None, None], (*rings.shape[:2], 1))
+def frusta_rings(frusta: Frusta) -> np.ndarray:
+    """The corners (rings, corners, 3) of stacked frusta, upwards."""
+    rings = frusta.radii[:, None, None] * polygon(frusta.squareness, _AROUND)
+    heights = np.broadcast_to(frusta.heights[:, None, None], (*rings.shape[:2], 1))
     return np.concatenate([rings, heights], axis=-1)
 
 
 def in_loft(loft: Loft, points: np.ndarray) -> np.ndarray:
-    """Which points (points, 3) lie in a loft: within the polygon it has at their height.
+    """Which points (points, 3) are inside a loft, within its polygon at their height.
 
-    A mesh splits what lies between two rings into triangles; where the rings have different shapes these differ from
-    the straight surface by less than 1e-4 m on the rings of a bottle's shoulder.
+    A mesh splits the surface between two rings into triangles. If the rings have different shapes, the triangles differ
+    slightly from the straight surface.
     """
     heights, radii = loft
     height = points[:, 2]
@@ -116,7 +144,7 @@ def loft_rings(loft: Loft) -> np.ndarray:
 
 
 def in_tube(tube: Tube, points: np.ndarray) -> np.ndarray:
-    """Between the mitre planes of a step, and inside the section it has there."""
+    """Which points (points, 3) are inside a tube: between the mitre planes of a step and within its section there."""
     rings = tube_rings(tube).reshape(-1, 3)
     near = np.flatnonzero(np.all((points >= rings.min(axis=0)) & (points <= rings.max(axis=0)), axis=1))
     flat, y = points[near][:, [0, 2]], points[near, 1]
@@ -141,7 +169,7 @@ def tube_rings(tube: Tube) -> np.ndarray:
 
 
 def mitres(line: np.ndarray) -> np.ndarray:
-    """The normal halving each bend, lengthened so that steps on both sides keep their thickness."""
+    """Bisecting normals of the bends, with a length that preserves the thickness of the steps on both sides."""
     normals = _normal(_directions(line))
     before, after = np.concatenate([normals[:1], normals]), np.concatenate([normals, normals[-1:]])
     return (before + after) / (1 + np.sum(before * after, axis=1, keepdims=True))
@@ -153,17 +181,17 @@ def _directions(line: np.ndarray) -> np.ndarray:
 
 
 def _normal(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (..., 2) of the x-z plane turned by 90 degrees, so that (turned, y, vector) is right-handed."""
+    """Vectors (..., 2) of the x-z plane rotated by 90 degrees, so that (rotated, y, vector) is right-handed."""
     return np.stack([vectors[..., 1], -vectors[..., 0]], axis=-1)
 
 
 def inset(distance, radius: float):
-    """How far a quarter circle of this radius draws back at a distance from the end it rounds."""
+    """Inset of a surface whose edge is rounded by a quarter circle of this radius, at a distance from the edge."""
     return radius - np.sqrt(np.maximum(radius**2 - np.maximum(radius - distance, 0) ** 2, 0))
 
 
 def bar_line(x_top: float, x_bottom: float, x_bar: float, top: float, bottom: float, radius: float) -> np.ndarray:
-    """A handle's centre line (points, 2) in the x-z plane: a level arm out to an upright bar, round corners, and an arm back."""
+    """Centre line (points, 2) of a handle in the x-z plane: two level arms, an upright bar, and round corners."""
     turn, middle = np.linspace(0, np.pi / 2, 40), (top + bottom) / 2
     x, z = x_bar - radius * (1 - np.sin(turn)), top - radius * (1 - np.cos(turn))
     return np.concatenate(
@@ -172,23 +200,23 @@ def bar_line(x_top: float, x_bottom: float, x_bar: float, top: float, bottom: fl
 
 
 def swept(line: np.ndarray, thickness: float, width: float, squareness: float, flare: float, count: int) -> Tube:
-    """A handle's tube along its centre line, `flare` times as thick at both ends, which it enters level, towards the axis."""
+    """Tube of a handle along its centre line, `flare` times as thick at both ends, with level ends towards the axis."""
     line = resample(line, count)
     scales = 1 + (flare - 1) * np.linspace(-1, 1, len(line)) ** 4
-    ends = np.stack([[0.4 * end[0], end[1]] for end in (line[0], line[-1])])  # buried, well inside the body
+    ends = np.stack([[0.4 * end[0], end[1]] for end in (line[0], line[-1])])  # well inside the body
     line = np.concatenate([ends[:1], line, ends[1:]])
     scales = np.concatenate([scales[:1], scales, scales[-1:]])
     return Tube(line, mitres(line), scales, np.array([thickness, width]) / 2, squareness)
 
 
 def bends_freely(tube: Tube) -> bool:
-    """Whether no ring of a tube cuts into the next."""
+    """Whether no ring of a tube intersects the next one."""
     steps = np.diff(tube_rings(tube)[..., [0, 2]], axis=0)
     return bool((np.einsum("smi,si->sm", steps, np.diff(tube.line, axis=0)) > 0).all())
 
 
 def resample(line: np.ndarray, count: int) -> np.ndarray:
-    """Place `count` points along a polyline, half by length and half by turning, so bends get short steps."""
+    """Place `count` points along a polyline, half by length and half by bending, so that bends have short steps."""
     knots = np.arange(len(line))
     between = np.linspace(0, len(line) - 1, 8 * (len(line) - 1) + 1)
     fine = np.stack([np.interp(between, knots, line[:, axis]) for axis in range(2)], axis=1)
@@ -201,8 +229,8 @@ def resample(line: np.ndarray, count: int) -> np.ndarray:
     return np.stack([np.interp(at, cost, fine[:, axis]) for axis in range(2)], axis=1)
 
 
-def skin(rings: np.ndarray) -> "trimesh.Trimesh":
-    """Close rings (rings, corners, 3), counter-clockwise about the way they go, with fans at both ends."""
+def closed_mesh(rings: np.ndarray) -> "trimesh.Trimesh":
+    """Mesh of rings (rings, corners, 3), counter-clockwise about their direction, with fans at both ends."""
     import trimesh
 
     count, corners = rings.shape[:2]

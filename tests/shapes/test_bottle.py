@@ -1,4 +1,4 @@
-"""The bottle family: closed meshes of the dimensions asked for, shoulders, necks, caps and mouths, handles, and the range of what is sampled."""
+"""The bottle family: dimensions, places, symmetry, errors, and the range of sampled dimensions."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ VARIANTS = {
 
 
 def along(bottle, level, direction=(1.0, 0.0)):
-    """Distances from the axis, 5e-6 m apart, that are clay at a level above the base."""
+    """Distances from the axis, 5e-6 m apart, that are material at a level above the base."""
     reach = np.arange(0, 0.1, 5e-6)
     flat = reach[:, None] * np.array(direction) / np.linalg.norm(direction)
     return reach[bottle.contains(np.column_stack([flat, np.full(len(reach), level - bottle.height / 2)]))]
@@ -40,7 +40,7 @@ def outer(bottle, levels, direction=(1.0, 0.0)):
 
 
 def on_axis(bottle, levels):
-    """Which levels of the axis are clay."""
+    """Which levels of the axis are material."""
     levels = np.asarray(levels) - bottle.height / 2
     return bottle.contains(np.column_stack([np.zeros((len(levels), 2)), levels]))
 
@@ -167,13 +167,13 @@ def test_a_handle_is_a_bar_of_its_section_at_its_reach_with_a_hole_for_fingers()
     middle, bar = (p.handle_top + p.handle_bottom) / 2, p.radius + p.handle_reach
     thick, wide = p.handle_thickness / 2, p.handle_width / 2
     assert at(bottle, bar, 0, middle) and not at(bare, bar, 0, middle)
-    for x, y, clay in (
+    for x, y, material in (
         (bar + 0.98 * thick, 0, True),
         (bar + 1.02 * thick, 0, False),
         (bar - 0.97 * thick, 0, True),
         (bar - 1.02 * thick, 0, False),
     ):
-        assert at(bottle, x, y, middle) == clay
+        assert at(bottle, x, y, middle) == material
     for side in (-1, 1):
         assert at(bottle, bar, side * 0.97 * wide, middle) and not at(bottle, bar, side * 1.02 * wide, middle)
     assert not at(bottle, p.radius + 0.002, 0, middle)  # between wall and bar
@@ -277,16 +277,17 @@ def test_sampled_bottles_are_built_and_have_every_symmetry():
 # ---- bad input ----
 
 
+RISE = "expected edge_radius, shoulder_bottom, shoulder_top and height to rise in this order"
 @pytest.mark.parametrize("change, message", [
     ({"height": -0.1}, "height is -0.1; expected a positive number"),
-    ({"height": "tall"}, "height is 'tall'; expected a finite number"),
-    ({"radius": float("nan")}, "radius is nan; expected a finite number"),
+    ({"height": "tall"}, "height is 'tall'; expected a positive number"),
+    ({"radius": float("nan")}, "radius is nan; expected a positive number"),
     ({"radius": 0.0}, "radius is 0.0; expected a positive number"),
     ({"neck_radius": float("inf")}, "neck_radius is inf"),
     ({"cap_radius": 0.0}, "cap_radius is 0.0"),
-    ({"edge_radius": -0.001}, "edge_radius is -0.001; expected zero or a positive number"),
-    ({"cap_height": -0.001}, "cap_height is -0.001; expected zero or a positive number"),
-    ({"mouth_depth": -0.001}, "mouth_depth is -0.001; expected zero or a positive number"),
+    ({"edge_radius": -0.001}, "edge_radius is -0.001; expected one finite number of 0 or more"),
+    ({"cap_height": -0.001}, "cap_height is -0.001; expected one finite number of 0 or more"),
+    ({"mouth_depth": -0.001}, "mouth_depth is -0.001; expected one finite number of 0 or more"),
     ({"bulge": float("nan")}, "bulge is nan"),
     ({"aspect": 0.34}, "aspect is 0.34; expected 0.35 to 1"),
     ({"aspect": 1.1}, "aspect is 1.1"),
@@ -299,9 +300,9 @@ def test_sampled_bottles_are_built_and_have_every_symmetry():
     ({"neck_taper": 1.2}, "neck_taper is 1.2"),
     ({"cap_taper": 0.2}, "cap_taper is 0.2; expected 0.3 to 1.1"),
     ({"cap_taper": 1.2}, "cap_taper is 1.2"),
-    ({"shoulder_bottom": 0.18}, "expected edge_radius, shoulder_bottom, shoulder_top and height to rise in this order"),
-    ({"shoulder_top": 0.23}, "expected edge_radius, shoulder_bottom, shoulder_top and height to rise in this order"),
-    ({"shoulder_bottom": 0.003}, "expected edge_radius, shoulder_bottom, shoulder_top and height to rise in this order"),
+    ({"shoulder_bottom": 0.18}, RISE),
+    ({"shoulder_top": 0.23}, RISE),
+    ({"shoulder_bottom": 0.003}, RISE),
     ({"cap_height": 0.0495}, "cap_height must be less than the neck's"),
     ({"bulge": 0.011}, "bulge must be less than 0.3 of radius"),
     ({"bulge": -0.011}, "bulge must be less than 0.3 of radius"),

@@ -1,4 +1,4 @@
-"""The bowl family: closed meshes of the dimensions asked for, places that lie on the clay, and the range of what is sampled."""
+"""The bowl family: closed meshes of given dimensions, places on the material, and the range of sampled dimensions."""
 
 from dataclasses import replace
 
@@ -24,8 +24,8 @@ VARIANTS = {
 }
 
 
-def clay_along(bowl, level, direction=(1.0, 0.0)):
-    """Distances from the axis, 5e-6 m apart, that are clay at a level above the base."""
+def material_along(bowl, level, direction=(1.0, 0.0)):
+    """Distances from the axis, 5e-6 m apart, that are material at a level above the base."""
     reach = np.arange(0, 0.1, 5e-6)
     flat = reach[:, None] * np.array(direction) / np.linalg.norm(direction)
     return reach[bowl.contains(np.column_stack([flat, np.full(len(reach), level - bowl.height / 2)]))]
@@ -33,7 +33,7 @@ def clay_along(bowl, level, direction=(1.0, 0.0)):
 
 def outer(bowl, levels, direction=(1.0, 0.0)):
     """Radius of the outside at levels above the base."""
-    return np.array([clay_along(bowl, level, direction)[-1] for level in levels])
+    return np.array([material_along(bowl, level, direction)[-1] for level in levels])
 
 
 def below_the_rim(p, count=5):
@@ -54,7 +54,7 @@ def test_every_variant_is_one_closed_bowl_that_stands_on_its_base(name):
 
 @pytest.mark.parametrize("name", VARIANTS)
 def test_radius_flare_and_aspect_are_the_extents_of_a_sharp_rim(name):
-    """A lip draws the uppermost ring back; without it the rim is as wide as the parameters say, the long side along x."""
+    """A lip narrows the uppermost ring; without it the rim is as wide as the parameters, with the long side along x."""
     p = replace(VARIANTS[name], lip_radius=0.0)
     bowl = build_bowl(p)
     np.testing.assert_allclose(outer(bowl, [p.height - 1e-6]), p.radius + p.rim_flare, atol=2e-5)
@@ -69,16 +69,16 @@ def test_radius_flare_and_aspect_are_the_extents_of_a_sharp_rim(name):
 
 @pytest.mark.parametrize("name", VARIANTS)
 def test_the_wall_is_as_thick_as_asked_across_it(name):
-    """Inwards from the outside along its normal: clay up to the thickness, air from there on."""
+    """Inwards from the outside along its normal: material up to the thickness, air from there on."""
     p = replace(VARIANTS[name], lip_radius=0.0)
     bowl, levels, step = build_bowl(p), below_the_rim(p), 2e-4
     radius = outer(bowl, levels)
     slope = (outer(bowl, levels + step) - outer(bowl, levels - step)) / (2 * step)
     inward = np.stack([-np.ones_like(slope), np.zeros_like(slope), slope], axis=1) / np.hypot(1, slope)[:, None]
     surface = np.stack([radius, np.zeros_like(radius), levels - p.height / 2], axis=1)
-    for share, clay in ((0.02, True), (0.5, True), (0.97, True), (1.03, False), (1.5, False)):
+    for share, material in ((0.02, True), (0.5, True), (0.97, True), (1.03, False), (1.5, False)):
         np.testing.assert_array_equal(
-            bowl.contains(surface + share * p.wall_thickness * inward), clay, err_msg=f"{share}"
+            bowl.contains(surface + share * p.wall_thickness * inward), material, err_msg=f"{share}"
         )
 
 
@@ -94,14 +94,14 @@ def test_a_drawn_in_rim_has_the_walls_thickness_and_a_top(change):
     assert bowl.contains(bowl.frames["rim"][None, :3, 3] - [0, 0, 1e-5]).all()
     sharp = build_bowl(replace(p, lip_radius=0.0))
     low, high = outer(sharp, [p.height - 4e-4, p.height - 1e-4])
-    across = np.ptp(clay_along(sharp, p.height - 1e-4)) / np.hypot(1, (low - high) / 3e-4)
+    across = np.ptp(material_along(sharp, p.height - 1e-4)) / np.hypot(1, (low - high) / 3e-4)
     np.testing.assert_allclose(across, p.wall_thickness, rtol=0.1)
 
 
 def test_a_wall_of_an_oval_is_thinner_along_y_as_its_aspect():
     bowl = build_bowl(BowlParameters(aspect=0.65))
     for level in (0.02, 0.035, 0.05):
-        along_x, along_y = clay_along(bowl, level), clay_along(bowl, level, (0, 1))
+        along_x, along_y = material_along(bowl, level), material_along(bowl, level, (0, 1))
         np.testing.assert_allclose(along_y[[0, -1]], 0.65 * along_x[[0, -1]], atol=1e-5)
 
 
@@ -148,7 +148,7 @@ def test_foot_recess_and_floor_are_where_the_parameters_say():
     axis = np.column_stack([np.zeros((8, 2)), levels])
     np.testing.assert_array_equal(bowl.contains(axis), [False, False, True, True, False, False, False, False])
     for level in (0.0005, 0.004, 0.0075):  # the ring the bowl stands on
-        np.testing.assert_allclose(clay_along(bowl, level)[[0, -1]], [0.024, 0.030], atol=1.1e-5)
+        np.testing.assert_allclose(material_along(bowl, level)[[0, -1]], [0.024, 0.030], atol=1.1e-5)
     flat = build_bowl(replace(p, foot_height=0.0))
     levels = np.array([0.0001, 0.0038, 0.0042]) - p.height / 2
     np.testing.assert_array_equal(flat.contains(np.column_stack([np.zeros((3, 2)), levels])), [True, True, False])
@@ -162,7 +162,7 @@ def test_the_lip_rounds_both_edges_of_the_rim():
     below = np.array([0.0002, 0.0006, 0.0012])
     back = p.lip_radius - np.sqrt(p.lip_radius**2 - (p.lip_radius - below) ** 2)
     for depth, inset in zip(below, back, strict=True):
-        edges, before = (clay_along(bowl, p.height - depth)[[0, -1]] for bowl in (rounded, sharp))
+        edges, before = (material_along(bowl, p.height - depth)[[0, -1]] for bowl in (rounded, sharp))
         np.testing.assert_allclose(before, [p.radius - p.wall_thickness, p.radius], atol=5e-5)
         np.testing.assert_allclose(edges - before, [inset, -inset], atol=8e-5)  # six rings make the quarter circle
 
@@ -177,7 +177,7 @@ def test_places_are_the_rims_top_on_the_x_side_and_two_points_of_the_axis(name):
     rim, base, body = (bowl.frames[name][:3, 3] for name in ("rim", "base", "body"))
     np.testing.assert_array_equal(base, [0, 0, -p.height / 2])
     np.testing.assert_array_equal(body, [0, 0, 0])
-    top = clay_along(bowl, p.height - 1e-6)
+    top = material_along(bowl, p.height - 1e-6)
     np.testing.assert_allclose(rim, [(top[0] + top[-1]) / 2, 0, p.height / 2], atol=2e-5)
     rounded = build_bowl(replace(p, lip_radius=0.3 * p.wall_thickness))
     np.testing.assert_allclose(rounded.frames["rim"], bowl.frames["rim"], atol=1e-9)
@@ -213,7 +213,7 @@ def test_sampled_bowls_are_built_and_have_every_symmetry():
     assert {bowl.fold for bowl in bowls} == {0, 2, 4}
     for bowl in bowls:
         assert bowl.mesh.is_watertight and bowl.mesh.body_count == 1 and bowl.mesh.euler_number == 2
-        # Held above the rim's middle a gripper is in the air; a tenth of the wall below it, in the clay.
+        # Held above the rim's middle a gripper is in the air; a tenth of the wall below it, in the material.
         rim = bowl.frames["rim"][:3, 3]
         below = 0.1 * bowl.parameters.wall_thickness
         np.testing.assert_array_equal(bowl.contains(rim + np.array([[0, 0, -below], [0, 0, 1e-5]])), [True, False])
@@ -230,13 +230,13 @@ def test_sampled_bowls_are_built_and_have_every_symmetry():
     [
         ({"height": -0.1}, "height is -0.1; expected a positive number"),
         ({"height": 0.0}, "height is 0.0; expected a positive number"),
-        ({"height": "tall"}, "height is 'tall'; expected a finite number"),
-        ({"radius": float("nan")}, "radius is nan; expected a finite number"),
+        ({"height": "tall"}, "height is 'tall'; expected a positive number"),
+        ({"radius": float("nan")}, "radius is nan; expected a positive number"),
         ({"radius": float("inf")}, "radius is inf"),
         ({"wall_thickness": 0.0}, "wall_thickness is 0.0"),
         ({"bottom_thickness": 0.0}, "bottom_thickness is 0.0"),
         ({"base_radius": -0.01}, "base_radius is -0.01"),
-        ({"foot_height": -0.001}, "foot_height is -0.001; expected zero or a positive number"),
+        ({"foot_height": -0.001}, "foot_height is -0.001; expected one finite number of 0 or more"),
         ({"foot_width": 0.0}, "foot_width is 0.0"),
         ({"lip_radius": -0.001}, "lip_radius is -0.001"),
         ({"aspect": 0.39}, "aspect is 0.39; expected 0.4 to 1"),

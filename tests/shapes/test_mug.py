@@ -1,4 +1,4 @@
-"""Generated objects: closed meshes, ground truth frames, an inside test that agrees with the mesh, true symmetries; and the mug family."""
+"""Generated objects: closed meshes, ground truth frames, an exact inside test, true symmetries; and the mug family."""
 
 import subprocess
 import sys
@@ -107,7 +107,7 @@ def test_a_family_builds_its_category_with_its_places_in_a_frame_that_stands_upr
 
 @pytest.mark.parametrize("category, seed", [(category, seed) for category in OTHERS for seed in range(3)])
 def test_contains_of_every_family_agrees_with_the_winding_number_of_the_mesh(category, seed):
-    """Points near the surface keep 2e-4 m away: a bottle's mesh splits the quadrilaterals of its shoulder into triangles."""
+    """Points keep 2e-4 m from the surface: a bottle's mesh splits the quadrilaterals of its shoulder into triangles."""
     shape, rng = sampled(100 + seed, category), np.random.default_rng(seed)
     low, high = shape.mesh.bounds
     surface, normals = surface_samples(shape.mesh, rng, 60)
@@ -158,7 +158,7 @@ SYMMETRIC = [
 
 
 @pytest.mark.parametrize("category, change, fold", SYMMETRIC)
-def test_the_fold_is_the_symmetry_of_the_clay(category, change, fold):
+def test_the_fold_is_the_symmetry_of_the_solid(category, change, fold):
     """Turned by what its symmetry allows an object is itself, and by half of that it is not."""
     shape = FAMILIES[category].build(replace(PARAMETERS[category](), **change))
     assert shape.fold == fold
@@ -236,7 +236,7 @@ def test_scaled_keeps_the_shape_of_every_family(category, change, factor):
 
 @pytest.mark.parametrize("style", HANDLE_STYLES)
 @pytest.mark.parametrize("parameters", VARIANTS)
-def test_every_style_is_one_closed_cup_whose_grip_is_clay(style, parameters):
+def test_every_style_is_one_closed_cup_whose_grip_is_solid(style, parameters):
     mug = build_mug(replace(parameters, handle_style=style))
     assert_one_closed_cup(mug.mesh)
     grip = mug.handle_frame[:3, 3]
