@@ -45,11 +45,11 @@ def kept(
     """
     path = folder / f"{digest(json.dumps(about, sort_keys=True).encode())[:20]}.npz"
     if not path.exists():
-        arrays = dict(compute())
+        arrays: dict[str, Any] = dict(compute())
         replace_file(function, path, lambda file: np.savez(file, **arrays))
         return build({name: np.asarray(array) for name, array in arrays.items()})
     try:
         with path.open("rb") as opened, np.load(opened) as file:
             return build(dict(file))
     except Exception as error:  # damaged files raise whatever their parser stumbles on
-        raise InputError(f"{function}: cannot read {path} ({error}); delete it, and it is computed again") from None
+        raise InputError(f"{function}: {path} cannot be read ({error}); delete it, and it is computed again") from None

@@ -5,6 +5,11 @@ import functools
 import jax
 
 
+def chosen_precision() -> str | None:
+    """The `jax.default_matmul_precision` that the caller has set, or None."""
+    return jax.config.jax_default_matmul_precision  # pyright: ignore[reportAttributeAccessIssue]: added at run time
+
+
 def full_precision(function):
     """Decorator of a function that is traced with full float32 precision of products.
 
@@ -15,7 +20,7 @@ def full_precision(function):
 
     @functools.wraps(function)
     def traced(*arguments, **options):
-        with jax.default_matmul_precision(jax.config.jax_default_matmul_precision or "highest"):
+        with jax.default_matmul_precision(chosen_precision() or "highest"):
             return function(*arguments, **options)
 
     return traced

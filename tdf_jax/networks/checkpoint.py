@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from importlib import metadata, resources
 from pathlib import Path
+from typing import cast
 from urllib.parse import urlparse
 from urllib.request import url2pathname
 
@@ -138,7 +139,8 @@ def _locate(name_or_path: str | os.PathLike) -> Path:
     is_name = not path.suffix and str(name_or_path) == path.name
     if is_name and path.name not in shipped:
         raise InputError(
-            f"load_model(): there are no weights {path.name!r}; expected one of ({names}) or the path of a {SUFFIX} file"
+            f"load_model(): there are no weights {path.name!r}; expected one of ({names}), "
+            f"or the path of a {SUFFIX} file"
         )
     path = shipped[path.name] if is_name else path
     if not path.is_file():
@@ -180,7 +182,8 @@ def _record(kind: type, values: Mapping):
         raise _Refusal(f"its {error}") from None
     for field in dataclasses.fields(kind):
         value = getattr(record, field.name)
-        if isinstance(value, bool) or not isinstance(value, int | float if field.type is float else field.type):
+        kinds = int | float if field.type is float else cast(type, field.type)
+        if isinstance(value, bool) or not isinstance(value, kinds):
             raise _Refusal(f"its {kind.__name__}.{field.name} is a {type(value).__name__}; expected {field.type}")
     return record
 

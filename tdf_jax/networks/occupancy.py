@@ -16,6 +16,7 @@ import functools
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Any, cast
 
 import flax.linen as nn
 import jax
@@ -32,6 +33,7 @@ from tdf_jax.networks.vector_neurons import (
     VectorLeakyReLU,
     VectorLinear,
     VectorResidualBlock,
+    Vectors,
     map_planes,
     vector_dot,
 )
@@ -115,10 +117,12 @@ class Encoder(nn.Module):
             anchor = farthest_point(points, used) if anchor is None else anchor
             points = points - self.config.symmetry_breaking_offset * anchor
         where = None if used is None else used[:, None]
-        x, pooled = self.fc_pos(self.conv_pos(points * self.config.scaling, used)), None
+        x = self.fc_pos(self.conv_pos(points * self.config.scaling, used))
+        pooled: Vectors | None = None
         for index in range(self.config.blocks):
             x = getattr(self, f"block_{index}")(x, pooled)
             pooled = map_planes(lambda plane: jnp.mean(plane, axis=0, keepdims=True, where=where), x)
+        assert pooled is not None  # a network has at least one block
         return jnp.concatenate(self.fc_c(self.actvn_c(pooled))).T
 
 
@@ -261,13 +265,17 @@ def encode_latent(
     Returns:
         The latent, (latent, 3), in the network's unit; its vectors rotate with the cloud.
     """
-    return OccupancyNetwork(config).apply({"params": params}, points, used, anchor, method="encode_latent")
+    return _applied(params, config, points, used, anchor, method="encode_latent")
 
 
 @full_precision
 def condition(params, config: NetworkConfig, latent: Float[Array, "latent 3"]) -> Conditioned:
     """The decoder of a network folded onto a latent, (latent, 3), from `encode_latent`."""
-    return OccupancyNetwork(config).apply({"params": params}, latent, method="condition")
+    return _applied(params, config, latent, method="condition")
+
+
+def _applied(params, config: NetworkConfig, *arguments, method: str) -> Any:
+    return OccupancyNetwork(config).apply({"params": params}, *arguments, method=method)
 
 
 @full_precision
@@ -297,14 +305,16 @@ def decode(conditioned: Conditioned, x: Float[Array, "*batch 3"]) -> tuple[list,
 
 def initialise(key, config: NetworkConfig = NetworkConfig()) -> dict:
     """Random parameters, as nested dictionaries under the published names."""
-    return OccupancyNetwork(config).init(key, jnp.zeros((config.neighbours + 1, 3)))["params"]
+    variables = OccupancyNetwork(config).init(key, jnp.zeros((config.neighbours + 1, 3)))
+    return cast(dict, variables["params"])
 
 
 @functools.cache  # it takes a tenth of a second, and every load calls it
 def parameter_shapes(config: NetworkConfig) -> Mapping[str, tuple[int, ...]]:
     """Shape of every parameter, by dotted name."""
     shapes = jax.eval_shape(lambda: initialise(jax.random.key(0), config))
-    return MappingProxyType({name: leaf.shape for name, leaf in flatten_dict(shapes, sep=".").items()})
+    flat = cast(dict[str, jax.ShapeDtypeStruct], flatten_dict(shapes, sep="."))
+    return MappingProxyType({name: leaf.shape for name, leaf in flat.items()})
 
 
 def parameter_count(config: NetworkConfig) -> int:

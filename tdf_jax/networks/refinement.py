@@ -46,22 +46,21 @@ def refine(model: Model, field: DescriptorField, points: Float[Array, "points 3"
         The steps are VectorAdam's, which normalises vectors and not coordinates and so is rotation-equivariant: Ling,
         Sharp and Jacobson, NeurIPS 2022. Fitting a latent to observations follows DeepSDF: Park et al., CVPR 2019.
     """
-    points = checks.points("refine()", points)
-    if checks.traced(points):
+    cloud = checks.points("refine()", points)
+    if checks.traced(cloud):
         raise InputError(
             "refine(): the points are traced by jax.jit; expected an array. Call refine() outside jax.jit: it compiles "
             "its own loop"
         )
-    points = np.asarray(points)
+    cloud = np.asarray(cloud)
     steps = checks.count("refine()", "steps", steps, 0)
     if field.conditioned.config != model.config:
         raise InputError("refine(): the field is from a network of other sizes; expected the model that encoded it")
-    if len(points) > POINTS:
-        points = points[np.random.default_rng(0).permutation(len(points))[:POINTS]]
-    weights = (np.arange(POINTS) < len(points)).astype(points.dtype) / len(points)
-    conditioned = _refine(
-        model.params, model.config, field.latent, np.resize(points, (POINTS, 3)) - field.origin, weights, steps
-    )
+    if len(cloud) > POINTS:
+        cloud = cloud[np.random.default_rng(0).permutation(len(cloud))[:POINTS]]
+    weights = (np.arange(POINTS) < len(cloud)).astype(cloud.dtype) / len(cloud)
+    x = np.resize(cloud, (POINTS, 3)) - field.origin
+    conditioned = _refine(model.params, model.config, field.latent, x, weights, steps)
     return DescriptorField(conditioned, field.origin)
 
 

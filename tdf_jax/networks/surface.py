@@ -39,7 +39,8 @@ def surface_triangles(
     padded = np.zeros((-(-len(world) // CHUNK_POINTS) * CHUNK_POINTS, 3), np.float32)
     padded[: len(world)] = world
     values = np.concatenate([_logits(field, chunk) for chunk in padded.reshape(-1, CHUNK_POINTS, 3)])[: len(world)]
-    vertices, faces, _ = igl.marching_cubes(values.astype(float), grid, *map(int, counts), 0.0)
+    nx, ny, nz = map(int, counts)
+    vertices, faces, _ = igl.marching_cubes(values.astype(float), grid, nx, ny, nz, 0.0)
     return np.asarray(vertices)[np.asarray(faces)].reshape(-1, 3, 3)
 
 

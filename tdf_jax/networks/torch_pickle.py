@@ -8,6 +8,7 @@ treats the few names that such a pickle may contain as strings, never imports th
 import dataclasses
 import math
 import pickletools
+from typing import Any, TypeVar, cast
 
 import jax.numpy as jnp
 
@@ -26,6 +27,9 @@ STORAGES = {
 CONSTRUCTORS = {"collections.OrderedDict", "torch._utils._rebuild_tensor_v2", "torch._utils._rebuild_parameter"}
 STORAGE_LIMIT = 2**30  # bytes; the largest of the published network has 0.5 MB
 DIMENSION_LIMIT = 8  # bounds the product of a hostile file's shape; tensors of the network have two dimensions
+
+
+T = TypeVar("T")
 
 
 class Refusal(Exception):
@@ -117,7 +121,7 @@ def _run(pickled: bytes) -> object:
             case "BINGET" | "LONG_BINGET":
                 stack.append(memo[argument])
             case "GLOBAL":
-                stack.append(_global(argument.replace(" ", ".", 1)))
+                stack.append(_global(_expect(argument, str).replace(" ", ".", 1)))
             case "STACK_GLOBAL":
                 attribute, module = _expect(stack.pop(), str), _expect(stack.pop(), str)
                 stack.append(_global(f"{module}.{attribute}"))
@@ -131,7 +135,7 @@ def _run(pickled: bytes) -> object:
                 _expect(stack.pop(), dict)
                 _expect(stack[-1], dict)
             case _:
-                asked = f"INST {argument.replace(' ', '.', 1)}" if opcode.name == "INST" else opcode.name
+                asked = f"INST {str(argument).replace(' ', '.', 1)}" if opcode.name == "INST" else opcode.name
                 raise Refusal(f"its pickle asks for {asked}, an instruction that no state_dict needs")
     raise ValueError("no STOP")
 
@@ -145,20 +149,20 @@ def _global(name: str) -> _Global:
     return _Global(name)
 
 
-def _expect(value: object, kind: type):
+def _expect(value: object, kind: type[T]) -> T:
     if type(value) is not kind:
         raise ValueError(f"{type(value).__name__} where {kind.__name__} is expected")
-    return value
+    return cast(T, value)
 
 
 def _set_items(target: object, items: list) -> None:
     """Put items, which are keys and values in turn, into a dictionary."""
-    _expect(target, dict)
+    dictionary = _expect(target, dict)
     for key, value in zip(items[::2], items[1::2], strict=True):
         # Keys are flat because hashing a tuple that is nested in itself many times would not end.
         if type(key) not in (str, int):
             raise ValueError(f"{type(key).__name__} as a key")
-        target[key] = value
+        dictionary[key] = value
 
 
 def _construct(name: str, arguments: tuple) -> object:
@@ -183,7 +187,7 @@ def _storage(identifier: object) -> Storage:
     return storage
 
 
-def _tensor(storage: Storage, offset: object, shape: tuple, strides: tuple) -> Tensor:
+def _tensor(storage: Storage, offset: Any, shape: tuple, strides: tuple) -> Tensor:
     numbers = (offset, *shape, *strides)
     counts = all(type(number) is int and number >= 0 for number in numbers)
     if not counts or len(shape) != len(strides) or len(shape) > DIMENSION_LIMIT:

@@ -38,9 +38,10 @@ def _cross(a, b):
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-def map_planes(function, *planes):
+def map_planes(function, *planes) -> Vectors:
     """The planes x, y and z that a function makes of those of its arguments."""
-    return tuple(function(*plane) for plane in zip(*planes))
+    x, y, z = (function(*plane) for plane in zip(*planes))
+    return x, y, z
 
 
 def _reflection(inner, squared, slope):

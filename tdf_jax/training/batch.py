@@ -191,7 +191,7 @@ def _pair(rng, samples, diagonal, box, num_poses):
         place = 0 if rng.uniform() < FIRST_SHARE else rng.integers(1, len(a.places))
         x = rng.uniform(-0.5, 0.5, (box, 3)) * rng.uniform(*BOX_SIDES) * diagonal
         T_place_query = np.eye(4)
-        T_place_query[:3, :3] = Rotation.random(random_state=rng).as_matrix()
+        T_place_query[:3, :3] = Rotation.random(None, rng).as_matrix()
         if rng.uniform() < REMOTE_SHARE:
             T_place_query[:3, 3] = _direction(rng) * _log_uniform(rng, REMOTE_DISTANCES) * diagonal
         shown.append(_apply(a.places[place] @ T_place_query, x))
@@ -232,7 +232,7 @@ def _wrong(rng, right, diagonal):
     """A pose that differs from the right one by a rotation about the query frame's origin and a translation."""
     wrong = right.copy()
     if rng.uniform() < GLOBAL_SHARE:
-        wrong[:3, :3] = Rotation.random(random_state=rng).as_matrix()
+        wrong[:3, :3] = Rotation.random(None, rng).as_matrix()
         wrong[:3, 3] = right[:3, 3] * rng.uniform(0, 1) + rng.normal(size=3) * GLOBAL_SPREAD * diagonal
         return wrong
     kind = rng.integers(3)  # rotated, translated, both

@@ -55,11 +55,9 @@ class TrainConfig:
         for name, low in lowest.items():
             checks.count("TrainConfig()", name, getattr(self, name), low)
         checks.count("TrainConfig()", "steps", self.steps, self.warmup + 1)
-        checks.count("TrainConfig()", "points", self.points, self.network.neighbours + 1)
+        checks.count("TrainConfig()", "points", self.points, self.network.neighbours + 1, DENSE_POINTS)
         if self.batch % 2:
             raise InputError(f"TrainConfig(): batch is {self.batch}; expected an even number, objects come in pairs")
-        if self.points > DENSE_POINTS:
-            raise InputError(f"TrainConfig(): points is {self.points}; expected at most {DENSE_POINTS}")
         checks.positive("TrainConfig()", "learning_rate", self.learning_rate)
         checks.number("TrainConfig()", "corruption", self.corruption, 0, 1)
         if not self.save_seconds >= 0:  # infinity never saves before the end

@@ -10,6 +10,7 @@ import signal
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -173,7 +174,7 @@ def build(recipe: Recipe, directory: str | Path, workers: int = 1, progress: boo
         rows = iter(tqdm(rows, desc="labelling objects", total=len(tasks), disable=not progress))
         for name, _, indices in missing:
             columns = zip(*(next(rows) for _ in indices), strict=True)
-            arrays = {field: np.stack(column) for field, column in zip(Labelled._fields, columns, strict=True)}
+            arrays: dict[str, Any] = dict(zip(Labelled._fields, map(np.stack, columns), strict=True))
             arrays |= {field: np.packbits(arrays[field], axis=-1) for field in BITS}
             replace_file("tdf dataset", directory / name, lambda file, arrays=arrays: np.savez(file, **arrays))
 

@@ -99,7 +99,9 @@ def _labelled(mesh, contains, places, fold, rng, points, queries, cameras):
     places = places.copy()
     places[:, :3, 3] /= diagonal
     surface_unit, x_unit, places = (array.astype(np.float32) for array in (surface / diagonal, x / diagonal, places))
-    return Labelled(surface_unit, x_unit, contains(x), visible, places, np.float32(diagonal), np.int8(fold))
+    return Labelled(
+        surface_unit, x_unit, contains(x), visible, places, np.asarray(diagonal, np.float32), np.asarray(fold, np.int8)
+    )
 
 
 def canonical_mesh(path, unit: float, up: str, front: str) -> "trimesh.Trimesh":

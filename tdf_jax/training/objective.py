@@ -8,6 +8,7 @@ import optax
 from jaxtyping import Array, Float
 
 from tdf_jax._internal.devices import one_at_a_time
+from tdf_jax._internal.precision import chosen_precision
 from tdf_jax.networks.field import DescriptorField
 from tdf_jax.networks.occupancy import NetworkConfig, condition, decode, encode_latent
 from tdf_jax.training.batch import QUARTERS
@@ -132,7 +133,7 @@ def mean_gradient(params, config: NetworkConfig, *samples):
     and is faster there than `vmap`. Products have the default precision of the device, which is less than float32 on
     some accelerators; the shipped weights of bowls, of bottles and of all three categories were trained so.
     """
-    with jax.default_matmul_precision(jax.config.jax_default_matmul_precision or "default"):
+    with jax.default_matmul_precision(chosen_precision() or "default"):
         return _mean_gradient(params, config, samples)
 
 

@@ -101,6 +101,6 @@ def _read(path, parse):
     except Exception as error:  # damaged files raise whatever their parser stumbles on
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(
-            f"train(): cannot read {path} ({reason}): it is damaged or of another version. Delete the folder, or "
+            f"train(): {path} cannot be read ({reason}): it is damaged or of another version. Delete the folder, or "
             "restore the file"
         ) from None

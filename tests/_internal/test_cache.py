@@ -24,7 +24,7 @@ def test_a_damaged_file_is_named(tmp_path):
     kept("who", tmp_path, 1, lambda: {"x": 1})
     (path,) = tmp_path.iterdir()
     path.write_bytes(path.read_bytes()[:-30])
-    with pytest.raises(InputError, match=rf"^who: cannot read .*{path.name} .*; delete it"):
+    with pytest.raises(InputError, match=rf"^who: .*{path.name} cannot be read .*; delete it"):
         kept("who", tmp_path, 1, lambda: {"x": 1})
 
 

@@ -1,6 +1,7 @@
 """Names of the release before: accepted with a warning, and equal in what they do."""
 
 import dataclasses
+import json
 
 import jax
 import numpy as np
@@ -10,6 +11,8 @@ import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
 from tdf_jax.solvers.result import Result
+from tdf_jax.training import run_folder
+from tdf_jax.training.config import TrainConfig
 
 PATHS = ["line", "semicircle", "wave", "lift_over", "tilt_and_pour", "hang_on_rack"]
 
@@ -150,3 +153,43 @@ def test_clearance_takes_lever_and_has_least():
     found = tdf.clearance(tdf.line(2), np.zeros((1, 3)), [tdf.box_obstacle((0.5, 0, 0), (0.2, 1, 1))], between=0)
     with pytest.warns(DeprecationWarning, match=r"^Clearance.least is deprecated; use Clearance.min$"):
         assert found.least == found.min == pytest.approx(0.4)
+
+
+def test_a_network_takes_asymmetry():
+    with pytest.warns(
+        DeprecationWarning, match=r"^NetworkConfig\(asymmetry=...\) is deprecated; use symmetry_breaking_offset=$"
+    ):
+        config = tdf.NetworkConfig(asymmetry=0.1)
+    with pytest.warns(DeprecationWarning, match=r"^NetworkConfig.asymmetry is deprecated; use NetworkConfig.symmetry_"):
+        assert config.asymmetry == config.symmetry_breaking_offset == 0.1
+
+
+def test_encode_takes_thinnings(small_model):
+    cloud = np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32)
+    with pytest.warns(DeprecationWarning, match=r"^encode\(thinnings=...\) is deprecated; use num_subsamples=$"):
+        old = tdf.encode(small_model, cloud, thinnings=0)
+    np.testing.assert_array_equal(old.latent, tdf.encode(small_model, cloud, num_subsamples=0).latent)
+
+
+def test_training_takes_poses():
+    with pytest.warns(DeprecationWarning, match=r"^TrainConfig\(poses=...\) is deprecated; use num_poses=$"):
+        config = TrainConfig(poses=5)
+    with pytest.warns(DeprecationWarning, match=r"^TrainConfig.poses is deprecated; use TrainConfig.num_poses$"):
+        assert config.poses == config.num_poses == 5
+
+
+def test_a_run_of_the_release_before_is_resumed(tmp_path):
+    """Its settings have former names, in the run's part and in the network's."""
+    settings = dataclasses.asdict(TrainConfig())
+    former = settings | {"poses": settings["num_poses"], "network": dict(settings["network"])}
+    former["network"]["asymmetry"] = former["network"].pop("symmetry_breaking_offset")
+    del former["num_poses"]
+    (tmp_path / run_folder.CONFIG).write_text(json.dumps(former))
+    run_folder.claim(tmp_path, settings)
+    assert run_folder.settings_of(tmp_path) == json.loads((tmp_path / run_folder.CONFIG).read_text()) == settings
+
+
+def test_a_shape_has_clay():
+    mug = tdf.build_mug()
+    with pytest.warns(DeprecationWarning, match=r"^Mug.clay is deprecated; use Mug.solid$"):
+        assert mug.clay is mug.solid

@@ -11,7 +11,7 @@ from tdf_jax.training import batch, dataset
 from tdf_jax.training.batch import DIAGONALS, PAIR_SPREAD, draw, validation_pairs
 from tdf_jax.training.dataset import DataSet, Recipe
 
-SIZES = {"pairs": 3, "points": 200, "queries": 50, "box": 12, "poses": 6}
+SIZES = {"pairs": 3, "points": 200, "queries": 50, "box": 12, "num_poses": 6}
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def objects(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     monkeypatch.setattr(batch, "DENSE_POINTS", 1000)
-    monkeypatch.setattr(batch, "SPARSE_CLOUDS", (250, 1000))
+    monkeypatch.setattr(batch, "SPARSE_POINTS", (250, 1000))
 
 
 def drawn(objects, seed, corruption=0.0, **changes):

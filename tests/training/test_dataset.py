@@ -173,7 +173,7 @@ def test_meshes_of_quarter_turns_and_more_stretch_alike_along_x_and_y(fold):
 @pytest.mark.parametrize(
     ("mesh", "message"),
     [
-        (trimesh.creation.box(extents=(1, 1, 1e-4)), "encloses next to nothing"),
+        (trimesh.creation.box(extents=(1, 1, 1e-4)), "encloses almost no volume"),
         (trimesh.Trimesh(BOX.vertices, BOX.faces[:6]), "is open"),
     ],
 )
@@ -224,7 +224,7 @@ def test_an_interrupted_build_goes_on_to_the_same_data_set(tmp_path, monkeypatch
         "training-0000.npz",
         "training-0001.npz",
     ]
-    with pytest.raises(InputError, match=r"no training-0002.npz; the data set is not finished: run its tdf dataset"):
+    with pytest.raises(InputError, match=r"no training-0002.npz; the data set is not finished. Run its tdf dataset"):
         load(tmp_path / "cut")
     before = (tmp_path / "cut" / "training-0000.npz").stat().st_mtime_ns
     monkeypatch.setattr(dataset, "_label", label)
@@ -371,7 +371,7 @@ def test_one_data_set_joined_is_itself():
 def test_data_sets_with_other_counts_are_not_joined():
     with pytest.raises(
         InputError,
-        match=r"joined\(\): the data sets differ in places; expected as many points, queries, cameras and places",
+        match=r"joined\(\): the data sets differ in places; expected the same numbers of points, queries, cameras and places",
     ):
         joined([some([1, 1]), some([0, 0], places=7)])
     fewer = some([1, 1])
@@ -390,16 +390,16 @@ def test_a_data_set_of_another_symmetry_is_another_one():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"objects": 0}, "objects is 0; expected at least 1"),
+        ({"objects": 0}, "objects is 0; expected a whole number of at least 1"),
         ({"validation": 3}, "validation is 3; expected an even number"),
         ({"seed": -1}, "seed is -1"),
-        ({"unit": 0.0}, "unit is 0.0; expected metres per unit"),
+        ({"unit": 0.0}, "unit is 0.0; expected a positive number, metres per unit"),
         ({"up": "z"}, "'z' is no axis; expected one of"),
         ({"up": "+x", "front": "-x"}, r"up is \+x and front is -x, which are parallel"),
         ({"stretch": 2.0}, "stretch is 2.0"),
         ({"category": "cup"}, "category is 'cup'; expected one of mug, bowl, bottle"),
         ({"meshes": ".", "fold": 3}, "fold is 3; expected one of 0, 1, 2, 4"),
-        ({"fold": 2}, "fold is for meshes; generated objects know theirs; drop it"),
+        ({"fold": 2}, "fold is for meshes; generated objects have their own; omit it"),
         ({"fold": 0, "category": "bowl"}, "fold is for meshes"),
     ],
 )

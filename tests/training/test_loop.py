@@ -66,7 +66,7 @@ def train(sets, quick_compilation):
         patch.setattr(loop, "TRANSFER", OptimizeConfig(num_starts=2, iterations=2))
         patch.setattr(loop, "VALIDATION_BOX", 8)
         patch.setattr(loop, "VALIDATION_POSES", 5)
-        patch.setattr("tdf_jax.training.batch.SPARSE_CLOUDS", (40, 300))
+        patch.setattr("tdf_jax.training.batch.SPARSE_POINTS", (40, 300))
         # half a metre is too much for so small a network
         patch.setattr("tdf_jax.training.batch.DIAGONALS", (0.12, 0.25))
         yield lambda config, directory, data=sets, **options: loop.train(
@@ -420,7 +420,7 @@ def test_validation_objects_without_another_of_their_kind_are_refused(train, set
         {"points": 20},
         {"points": 2001},
         {"queries": 0},
-        {"poses": 1},
+        {"num_poses": 1},
         {"seed": -1},
     ]
     + [{"learning_rate": float("nan")}, {"corruption": 1.5}, {"save_seconds": -1.0}, {"validate_every": 0}, {"box": 0}],
