@@ -40,7 +40,7 @@ def colliding_scene(seed: int, body: Float[Array, "queries 3"]) -> tuple[Traject
                 )
             )
         measured = clearance(path, body, boxes, between=7)
-        if measured.least < 0 and measured.waypoints[[0, -1]].min() > 0.01:
+        if measured.min < 0 and measured.waypoints[[0, -1]].min() > 0.01:
             return path, boxes
 
 
@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         start = time.perf_counter()
         cleared = push_clear(path, body, boxes)
         seconds = time.perf_counter() - start
-        checked = clearance(cleared.trajectory, body, boxes, between=100).least
+        checked = clearance(cleared.trajectory, body, boxes, between=100).min
         rows.append((cleared.clear, checked, length(cleared.trajectory) / length(path) - 1, seconds))
         if not cleared.clear:
             print(f"scene {seed}: {cleared.status}", flush=True)

@@ -1,4 +1,4 @@
-"""A demonstration on disk: one .npz file of three arrays, metres, world frame."""
+"""Demonstrations in files: one .npz file of three arrays."""
 
 import os
 import zipfile
@@ -19,32 +19,33 @@ def save_demonstration(path: str | os.PathLike, demonstration: Demonstration) ->
     """Write a demonstration.
 
     Args:
-        path: an .npz file in an existing folder. It gets the arrays `points` (points, 3), the object's cloud;
-            `wxyz_xyz` (poses, 7), T_world_query from the pick to the place; `query` (queries, 3), in the query frame.
-        demonstration: what to write.
+        path: .npz file in an existing folder. It holds three arrays: `points`, the object point cloud, (points, 3),
+            metres, world frame; `wxyz_xyz`, the poses T_world_query from the pick to the place, (poses, 7); `query`,
+            the query points, (queries, 3), metres, query frame.
+        demonstration: demonstration to write.
 
     Raises:
-        InputError: another suffix, or the file cannot be written.
+        InputError: the suffix is not .npz, or the file cannot be written.
     """
-    path = _npz("save_demonstration", path)
-    values = (demonstration.points, demonstration.trajectory.wxyz_xyz, demonstration.query)
-    arrays = {name: np.asarray(value) for name, value in zip(ARRAYS, values)}
-    replace_file("save_demonstration", path, lambda file: np.savez(file, **arrays))
+    path = _npz("save_demonstration()", path)
+    points, query = np.asarray(demonstration.points), np.asarray(demonstration.query)
+    wxyz_xyz = np.asarray(demonstration.trajectory.wxyz_xyz)
+    replace_file("save_demonstration", path, lambda file: np.savez(file, points=points, wxyz_xyz=wxyz_xyz, query=query))
 
 
 def load_demonstration(path: str | os.PathLike) -> Demonstration:
     """Read a demonstration that `save_demonstration` wrote, or any .npz file of the same three arrays.
 
     Args:
-        path: the file.
+        path: .npz file.
 
     Returns:
         The demonstration, float32.
 
     Raises:
-        InputError: the file is missing, unreadable, without one of the arrays, or they make no demonstration.
+        InputError: the file is missing or unreadable, an array is missing, or the arrays are not a demonstration.
     """
-    path = _npz("load_demonstration", path)
+    path = _npz("load_demonstration()", path)
     if not path.is_file():
         raise InputError(f"load_demonstration(): there is no file {path}; check the path")
     try:
@@ -60,7 +61,7 @@ def load_demonstration(path: str | os.PathLike) -> Demonstration:
             raise InputError(f"load_demonstration(): {name} in {path} has dtype {array.dtype}; expected numbers")
     points, wxyz_xyz, query = (arrays[name].astype(np.float32) for name in ARRAYS)
     try:
-        return Demonstration(points, Trajectory(jnp.asarray(wxyz_xyz)), query)
+        return Demonstration(points, Trajectory(jnp.asarray(wxyz_xyz)), query)  # pyright: ignore[reportArgumentType]
     except InputError as error:
         raise InputError(f"load_demonstration(): {path}: {error}") from None
 
@@ -68,5 +69,5 @@ def load_demonstration(path: str | os.PathLike) -> Demonstration:
 def _npz(function: str, path: str | os.PathLike) -> Path:
     path = Path(path)
     if path.suffix != ".npz":
-        raise InputError(f"{function}(): {path} has suffix {path.suffix!r}; expected .npz")
+        raise InputError(f"{function}: {path} has suffix {path.suffix!r}; expected .npz")
     return path

@@ -1,4 +1,4 @@
-"""Point clouds on the host: read, check, thin. Points are numpy arrays (points, 3) in metres."""
+"""Point clouds in files. Clouds are numpy arrays (points, 3), metres."""
 
 import zipfile
 from pathlib import Path
@@ -20,31 +20,31 @@ def load_points(
     """Read a point cloud, or sample one from a mesh.
 
     Args:
-        path: A mesh (.obj, .stl, .ply, .glb, .off) or a cloud (.ply without faces, .npy, .npz with the array
-            `points` or a single array, .xyz with x y z first in each line, .pcd ascii or binary).
-        count: How many points: of a mesh, drawn by area (default 1500); of a larger cloud, a random subset in the
-            file's order (default all points).
-        scale: Metres per unit of the file: 0.01 for centimetres.
-        seed: Seed of the draw.
+        path: mesh (.obj, .stl, .ply, .glb, .off) or cloud (.ply without faces, .npy, .npz with the array `points` or a
+            single array, .xyz with x y z first in each line, .pcd ascii or binary).
+        count: number of points. A mesh is sampled by area, by default 1500 points. A larger cloud is reduced to a
+            random subset in the order of the file, by default all points.
+        scale: metres per unit of the file, such as 0.01 for centimetres.
+        seed: seed of the samples.
 
     Returns:
-        Points, metres, float32.
+        Point cloud, (points, 3), metres, float32, in the frame of the file.
 
     Raises:
-        InputError: If the file is missing, unreadable or of another kind, or its points are no cloud.
+        InputError: the file is missing, unreadable or of another format, or its points are not a point cloud.
     """
-    path = existing_file("load_points", path, tuple(dict.fromkeys(MESH_SUFFIXES + _CLOUD_SUFFIXES)), scale)
-    if count is not None and count < 1:
-        raise InputError(f"load_points(): count is {count}; expected at least 1, or None for the default.")
+    path = existing_file("load_points()", path, tuple(dict.fromkeys(MESH_SUFFIXES + _CLOUD_SUFFIXES)), scale)
+    if count is not None:
+        checks.count("load_points()", "count", count)
     rng = np.random.default_rng(seed)
     if path.suffix.lower() in MESH_SUFFIXES:
-        scene = read_scene("load_points", path)
-        mesh = mesh_in("load_points", path, scene, scale)
+        scene = read_scene("load_points()", path)
+        mesh = mesh_in("load_points()", path, scene, scale)
         if mesh is not None:
             points = sample_surface(mesh, 1500 if count is None else count, rng)
             return checks.points("load_points()", points.astype(np.float32), str(path))
         if path.suffix.lower() not in _CLOUD_SUFFIXES:
-            raise InputError(f"load_points(): {path} is a mesh without faces; expected a surface, or a cloud as .ply.")
+            raise InputError(f"load_points(): {path} is a mesh without faces; expected a surface, or a cloud as .ply")
         parts = [np.asarray(part.vertices) for part in scene.geometry.values()]
         points = np.concatenate(parts) if parts else np.zeros((0, 3))
     else:
@@ -60,7 +60,7 @@ def _read_array(path: Path) -> np.ndarray:
     try:
         return readers[path.suffix.lower()](path)
     except (OSError, ValueError, EOFError, LookupError, zipfile.BadZipFile) as error:
-        raise unreadable("load_points", path, error) from error
+        raise unreadable("load_points()", path, error) from error
 
 
 def _read_npy(path: Path) -> np.ndarray:
@@ -97,11 +97,11 @@ def _read_pcd(path: Path) -> np.ndarray:
     lengths = [int(length) for length in header.get("COUNT", ["1"] * len(fields))]
     if header["DATA"] == ["ascii"]:
         starts = np.cumsum([0, *lengths])
-        points = _text_columns(body.decode(), tuple(starts[fields.index(axis)] for axis in "xyz"))
+        points = _text_columns(body.decode(), tuple(int(starts[fields.index(axis)]) for axis in "xyz"))
     elif header["DATA"] == ["binary"]:
         kinds = {"F": "f", "I": "i", "U": "u"}
         types = [f"<{kinds[kind]}{size}" for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
-        # Fields may share the name _ (padding), so the record's names are their positions.
+        # Several fields may have the name _ (padding), so the fields of the record are named by their index.
         record = np.dtype([(str(i), *part) for i, part in enumerate(zip(types, lengths, strict=True))])
         rows = np.frombuffer(body, dtype=record, count=count)
         points = np.stack([rows[str(fields.index(axis))].reshape(count) for axis in "xyz"], axis=1)

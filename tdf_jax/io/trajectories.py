@@ -1,4 +1,4 @@
-"""Trajectories on disk: .npz, and the text format of TUM."""
+"""Trajectories in files: .npz, and the text format of TUM."""
 
 import zipfile
 from pathlib import Path
@@ -16,20 +16,20 @@ def save_trajectory(path: str | Path, trajectory: Trajectory) -> None:
     """Write a trajectory.
 
     Args:
-        path: A .npz file (array `wxyz_xyz`), or a .tum file (lines `t x y z qx qy qz qw`, t the index in seconds).
-        trajectory: The trajectory.
+        path: .npz file (array `wxyz_xyz`), or .tum file (lines `t x y z qx qy qz qw`, where t is the index as seconds).
+        trajectory: trajectory to write, at least one pose.
 
     Raises:
-        InputError: If the suffix is unknown, the file cannot be written, or the trajectory fails `check_trajectory`.
+        InputError: the suffix is unknown, the file cannot be written, or the trajectory fails `check_trajectory`.
     """
-    path = _known_suffix("save_trajectory", path)
+    path = _known_suffix("save_trajectory()", path)
     wxyz_xyz = np.asarray(check_trajectory(trajectory).wxyz_xyz)
 
     def write(file: BinaryIO) -> None:
         if path.suffix == ".npz":
             np.savez(file, wxyz_xyz=wxyz_xyz)
         else:
-            digits = np.finfo(wxyz_xyz.dtype).precision + 3  # enough to read back the same bits
+            digits = np.finfo(wxyz_xyz.dtype).precision + 3  # enough digits to read the same bits
             rows = np.column_stack([np.arange(len(wxyz_xyz)), wxyz_xyz[:, [4, 5, 6, 1, 2, 3, 0]]])
             np.savetxt(file, rows, fmt=f"%.{digits}g", header="t x y z qx qy qz qw")
 
@@ -40,21 +40,24 @@ def load_trajectory(path: str | Path) -> Trajectory:
     """Read a trajectory written by `save_trajectory`, or another program's .tum file.
 
     Args:
-        path: A .npz or .tum file. In .tum the lines are poses in order, timestamps are not used, # starts a comment.
+        path: .npz or .tum file. The lines of a .tum file are poses in order; timestamps are ignored, and # starts a
+            comment.
 
     Returns:
         The trajectory.
 
     Raises:
-        InputError: If the file is missing or unreadable, or its poses fail `check_trajectory`.
+        InputError: the file is missing or unreadable, or its poses fail `check_trajectory`.
     """
-    path = _known_suffix("load_trajectory", path)
+    path = _known_suffix("load_trajectory()", path)
     if not path.is_file():
-        raise InputError(f"load_trajectory(): there is no file {path}; check the path.")
+        raise InputError(f"load_trajectory(): there is no file {path}; expected an existing file; check the path")
     try:
         wxyz_xyz = _READERS[path.suffix](path)
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError(f"load_trajectory(): {path} cannot be read as {path.suffix}: {error}.") from error
+        raise InputError(
+            f"load_trajectory(): {path} cannot be read as {path.suffix} ({error}); save it again"
+        ) from error
     return check_trajectory(Trajectory(jnp.asarray(wxyz_xyz)), str(path))
 
 
@@ -82,5 +85,5 @@ _READERS = {".npz": _read_npz, ".tum": _read_tum}
 def _known_suffix(function: str, path: str | Path) -> Path:
     path = Path(path)
     if path.suffix not in _READERS:
-        raise InputError(f"{function}(): {path} has suffix {path.suffix!r}; expected {' or '.join(_READERS)}.")
+        raise InputError(f"{function}: {path} has suffix {path.suffix!r}; expected {' or '.join(_READERS)}")
     return path

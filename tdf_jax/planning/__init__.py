@@ -1,7 +1,7 @@
 """Trajectories that keep clear of obstacles.
 
 Modules:
-    avoidance: `push_clear`
-    distances: `clearance`: distances of a moving body
-    occupied: an obstacle from a field
+    avoidance: `push_clear`: a trajectory moved clear of obstacles
+    distances: `clearance`: distances of a moving body from obstacles
+    occupied: `field_obstacle`: an obstacle made of a descriptor field
 """

@@ -117,7 +117,7 @@ def test_without_a_symmetry_the_truth_is_the_only_one():
 
 
 def test_the_size_weighs_rotations_against_translations():
-    """An estimate at the opposite side of the axis: its position is nearer to the rotated truth, its axes to the truth."""
+    """An estimate at the opposite side of the axis: near the rotated truth by position, near the truth by axes."""
     truth, found = np.eye(4), np.eye(4)
     truth[0, 3], found[0, 3] = 0.05, -0.05
     np.testing.assert_allclose(equivalent(found, truth, 2, 0.01), about_z(np.pi) @ truth, atol=1e-12)

@@ -1,4 +1,4 @@
-"""Visible points: of clouds by hidden point removal; of meshes, against marching along the rays through exact solids."""
+"""Visible points: of clouds by hidden point removal; of meshes, against marching along rays through exact solids."""
 
 import numpy as np
 import pytest

@@ -201,7 +201,7 @@ def test_wrong_paths_and_scales(tmp_path, load):
         load(tmp_path / "mug.txt")
     trimesh.creation.box().export(tmp_path / "box.stl")
     for scale in (0, -1, np.nan, np.inf):
-        with pytest.raises(InputError, match="scale is .*; expected metres per unit"):
+        with pytest.raises(InputError, match="scale is .*; expected a positive number, metres per unit"):
             load(tmp_path / "box.stl", scale=scale)
 
 

@@ -42,7 +42,7 @@ def ends_kept(cleared, trajectory):
 def assert_clear(cleared, trajectory, obstacles, margin=0.01, body=BODY):
     """Where the ends are clear themselves: by more looks than the library's own."""
     ends_kept(cleared, trajectory)
-    looked = clearance(cleared.trajectory, body, obstacles, between=100).least
+    looked = clearance(cleared.trajectory, body, obstacles, between=100).min
     assert cleared.clear and cleared.status.startswith("clear: moved by up to"), cleared.status
     assert looked > margin - 3e-4 and cleared.clearance == pytest.approx(looked, abs=3e-4)
     assert cleared.clearance >= margin - 1e-5 and cleared.excess >= -1e-5
@@ -60,8 +60,8 @@ def test_clearance_is_the_least_distance_at_poses_and_between():
         x = jnp.asarray(carried(pose, BODY))
         np.testing.assert_allclose(found.waypoints[i], [AWAY.distance(x).min(), wall.distance(x).min()], atol=1e-6)
     expected = least_by_hand(turning, BODY, [-0.25, 0.04, 0.09], [0.25, 0.06, 0.11])
-    assert found.least == pytest.approx(expected, abs=3e-4)
-    assert found.least == found.segments[:, 1].min() < found.waypoints.min() - 0.001
+    assert found.min == pytest.approx(expected, abs=3e-4)
+    assert found.min == found.segments[:, 1].min() < found.waypoints.min() - 0.001
     assert (found.segments <= np.minimum(found.waypoints[:-1], found.waypoints[1:])).all()
     at_poses = clearance(turning, BODY, [AWAY, wall], between=0)
     np.testing.assert_allclose(at_poses.segments, np.minimum(found.waypoints[:-1], found.waypoints[1:]), atol=1e-7)
@@ -72,12 +72,12 @@ def test_obstacles_of_several_kinds_keep_their_order():
     found = clearance(LINE, BODY, [AWAY, grid, IN_THE_WAY])
     alone = [clearance(LINE, BODY, [obstacle]).segments[:, 0] for obstacle in (AWAY, grid, IN_THE_WAY)]
     np.testing.assert_allclose(found.segments, np.stack(alone, axis=1), atol=1e-7)
-    assert found.segments[:, 1].min() == pytest.approx(7) and found.least < 0
+    assert found.segments[:, 1].min() == pytest.approx(7) and found.min < 0
 
 
 def test_one_pose_has_waypoints_only():
     found = clearance(tdf.Trajectory(LINE.wxyz_xyz[:1]), BODY, [AWAY])
-    assert isinstance(found, Clearance) and found.segments.shape == (0, 1) and found.least == found.waypoints[0, 0]
+    assert isinstance(found, Clearance) and found.segments.shape == (0, 1) and found.min == found.waypoints[0, 0]
 
 
 # Pushed clear
@@ -91,7 +91,7 @@ def test_a_clear_path_comes_back_as_it_is():
 
 
 def test_a_box_across_a_line_is_passed_by_the_near_side():
-    assert clearance(LINE, BODY, [IN_THE_WAY]).least < -0.01
+    assert clearance(LINE, BODY, [IN_THE_WAY]).min < -0.01
     cleared = push_clear(LINE, BODY, [IN_THE_WAY])
     assert_clear(cleared, LINE, [IN_THE_WAY])
     # The box reaches 2 cm to the left and 4 cm to the right of the line, the cube 2 cm: 5 cm of shift are enough on the
@@ -107,7 +107,7 @@ def test_a_wall_between_two_poses_is_seen_and_passed():
     wall = box_obstacle((0.0, 0.1667, 0.05), (0.4, 0.002, 0.3))
     body = BODY * np.float32([1, 0.1, 1])
     found = clearance(LINE, body, [wall])
-    assert found.waypoints.min() > 0.01 and found.least < 0
+    assert found.waypoints.min() > 0.01 and found.min < 0
     cleared = push_clear(LINE, body, [wall])
     assert_clear(cleared, LINE, [wall], body=body)
     # Under it is the shortest way.
@@ -117,7 +117,7 @@ def test_a_wall_between_two_poses_is_seen_and_passed():
 @pytest.mark.slow
 def test_a_post_in_a_semicircle_is_passed_and_margins_are_kept():
     arc, post = tdf.semicircle(12, (0, 0, 0), (0, 0.4, 0)), box_obstacle((0.19, 0.2, 0), (0.03, 0.03, 0.6))
-    assert clearance(arc, BODY, [post]).least < 0
+    assert clearance(arc, BODY, [post]).min < 0
     for margin in (0.005, 0.03):
         assert_clear(push_clear(arc, BODY, [post], margin=margin), arc, [post], margin)
 
@@ -181,7 +181,7 @@ def test_a_goal_inside_of_an_obstacle_is_told():
     cleared = push_clear(LINE, BODY, [AWAY, around], config=ONE_LOOK)
     ends_kept(cleared, LINE)
     assert not cleared.clear
-    assert "the last pose is 0.080 m inside of obstacle 1" in cleared.status and "move that end" in cleared.status
+    assert "the last pose is 0.080 m inside obstacle 1" in cleared.status and "move that end" in cleared.status
     assert (
         "the first pose"
         in push_clear(LINE, BODY, [box_obstacle((0, 0, 0), (0.2, 0.2, 0.2)), AWAY], config=ONE_LOOK).status
@@ -197,7 +197,7 @@ def test_a_closed_room_is_told():
     ends_kept(cleared, LINE)
     assert not cleared.clear and cleared.excess < -0.005
     assert cleared.status.startswith("not clear: 0.0") and "lower the margin" in cleared.status
-    assert cleared.clearance == pytest.approx(clearance(cleared.trajectory, BODY, room).least)
+    assert cleared.clearance == pytest.approx(clearance(cleared.trajectory, BODY, room).min)
 
 
 def test_two_poses_leave_nothing_to_push_and_that_is_told():
@@ -226,7 +226,7 @@ def test_bad_input_is_refused():
             with pytest.raises(InputError, match=rf"{name}\(\): obstacles\[1\] is a"):
                 function(LINE, BODY, [AWAY, obstacle])
         for body in (BODY[:, :2], BODY[:0], BODY * np.nan, [["a"] * 3]):
-            with pytest.raises(InputError, match=rf"{name}\(\): body has shape"):
+            with pytest.raises(InputError, match=rf"{name}\(\): body has"):
                 function(LINE, body, [AWAY])
         with pytest.raises(InputError, match="NaN or infinite"):
             function(tdf.Trajectory(np.full((2, 7), np.inf)), BODY, [AWAY])
@@ -239,7 +239,7 @@ def test_bad_input_is_refused():
     with pytest.raises(InputError, match="config is"):
         push_clear(LINE, BODY, [AWAY], config={"ramp": 1})
     for bad in (
-        {"lever": 0.0},
+        {"rotation_scale": 0.0},
         {"ramp": -1.0},
         {"deviation": np.inf},
         {"contact": -0.1},
