@@ -201,7 +201,7 @@ def _draw(folder: Path, model: "Model", outcomes: "Outcomes") -> None:
 
 
 def _panel(model: "Model", outcome: "Outcome", index: int) -> "Panel":
-    import jax.numpy as jnp
+    import jax
     import numpy as np
 
     from tdf_jax.evaluation.cases import QUERY_SIZE
@@ -212,7 +212,7 @@ def _panel(model: "Model", outcome: "Outcome", index: int) -> "Panel":
     from tdf_jax.viz.reconstruction import Panel
 
     case, iou = outcome.cases[index], outcome.ious["iou_refined"][index]
-    T_world_b, points = case.T_world_b, jnp.asarray(case.points_b)
+    T_world_b, points = case.T_world_b, jax.device_put(case.points_b)
     estimate, T_world_estimate = outcome.estimates[index], np.eye(4)
     T_world_estimate[:3, :3], T_world_estimate[:3, 3] = se3.rotation(estimate), estimate[4:]
     return Panel(

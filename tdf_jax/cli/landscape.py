@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Annotated, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 from tqdm import tqdm
@@ -56,7 +55,7 @@ def landscape(settings: Annotated[LandscapeSettings, tyro.conf.arg(name="")] = L
     began = time.perf_counter()
     model = load_model(cast(str, settings.weights))
     scene = make_scene(settings, jax.random.fold_in(jax.random.key(settings.seed), STREAM))
-    field = encode(model, jnp.asarray(scene.points))
+    field = encode(model, jax.device_put(scene.points))
     given = describe(model, scene.demonstration)
     waypoints = np.asarray(given.trajectory.translations + field.origin, dtype=float)
     rotations = _rotations(settings, np.asarray(given.trajectory.rotations[0], dtype=float))

@@ -5,7 +5,6 @@ import zlib
 from typing import cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -205,7 +204,7 @@ def place_demonstration(
     start, end = pick[:3, 3], pick[:3, 3] + np.multiply(goal_offset, case.scale)
     bow = {} if bulge is None or path not in SHAPES or path == "line" else {"bulge": bulge}
     trajectory = PATHS[path](num_poses, start, end, rotation=pick[:3, :3], **bow)
-    return Demonstration(jnp.asarray(case.points_a), trajectory, query)
+    return Demonstration(jax.device_put(case.points_a), trajectory, query)
 
 
 def _scale(function: str, clouds: str) -> float:

@@ -98,14 +98,14 @@ def _demonstrations(task, seed, count) -> list[Demonstration]:
             *(jnp.asarray(part, jnp.float32) for part in (mug.handle_frame[:3, :3], mug.handle_frame[:3, 3]))
         )
         points = sample_surface(mug.mesh, POINTS, number).astype(np.float32)
-        demonstrations.append(Demonstration(jnp.asarray(points), Trajectory(pose[None]), task.demonstration.query))
+        demonstrations.append(Demonstration(jax.device_put(points), Trajectory(pose[None]), task.demonstration.query))
     return demonstrations
 
 
 def _pick(task, model, demonstrations, way, seed) -> dict:
     key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), STREAM), task.index)
     reference: Reference = describe(model, demonstrations, combine=way)
-    result = carry(encode(model, jnp.asarray(task.case.points_b)), reference, key, fix_last=False)
+    result = carry(encode(model, jax.device_put(task.case.points_b)), reference, key, fix_last=False)
     distance, angle = pose_error(result.trajectory.wxyz_xyz[0], task.expected.wxyz_xyz[0])
     return {"distance": distance, "angle": np.degrees(angle)}
 

@@ -117,7 +117,7 @@ class Attempts:
 
 def _encoded(task, model) -> _Encoded:
     began = time.perf_counter()
-    reference, field = describe(model, task.demonstration), encode(model, jnp.asarray(task.case.points_b))
+    reference, field = describe(model, task.demonstration), encode(model, jax.device_put(task.case.points_b))
     jax.block_until_ready((reference, field))
     return _Encoded(field, reference, time.perf_counter() - began, {})
 

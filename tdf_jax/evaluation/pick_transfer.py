@@ -56,7 +56,7 @@ def transferred(
     estimates = []
     for index, case in enumerate(tqdm(cases, desc="transferring", disable=not progress)):
         reference = place_reference(model, case, box_query(query_key, count=QUERIES, size=QUERY_SIZE * case.scale))
-        field = encode(model, jnp.asarray(case.points_b))
+        field = encode(model, jax.device_put(case.points_b))
         key = jax.random.fold_in(start_key, index)
         result = optimize(field, reference, key, fix_last=False, energy=EnergyWeights(0.0), config=config)
         estimates.append(result.trajectory.wxyz_xyz[0])
@@ -106,7 +106,7 @@ def place_reference(model: Model, case: Transfer, query: Float[Array, "queries 3
         case: the transfer.
         query: query points, (queries, 3), metres, query frame.
     """
-    field = encode(model, jnp.asarray(case.points_a))
+    field = encode(model, jax.device_put(case.points_a))
     place = jnp.asarray(case.T_world_place_a, jnp.float32)
     T_world_query = se3.pose(place[:3, :3], place[:3, 3])
     demonstrated = Trajectory(T_world_query[None]).shifted(-field.origin)
@@ -138,7 +138,7 @@ def overlaps(
         measured: dict[str, float | None] = dict.fromkeys(OVERLAPS)
         if true is not None:
             world = (x @ case.T_world_b[:3, :3].T + case.T_world_b[:3, 3]).astype(np.float32)
-            points = jnp.asarray(case.points_b)
+            points = jax.device_put(case.points_b)
             field = encode(model, points)
             for name, shape in zip(OVERLAPS, (field, refine(model, field, points))):
                 measured[name] = _overlap(np.asarray(_occupancy(shape, world)) > 0.5, true)

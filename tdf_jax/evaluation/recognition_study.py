@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -49,7 +48,7 @@ def evidence(model: Model, category: str, seed: int, index: int, right: bool) ->
     demonstration = place_demonstration(case, "line", 2, box_query(jax.random.key(seed), QUERIES, QUERY_SIZE))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CategoryWarning)
-        points = jnp.asarray(target.points_b)
+        points = jax.device_put(target.points_b)
         result = imitate(model, demonstration, points, key=jax.random.key(index), fix_last=False)
     return float(result.residual), surface_logit(encode(model, points), points)
 

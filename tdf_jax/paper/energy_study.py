@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from tdf_jax._internal.errors import InputError
@@ -67,7 +66,7 @@ def pair_problem(model: Model, index: int) -> Problem:
     query = box_query(jax.random.key(index), QUERIES, QUERY_SIZE)
     shape = list(SHAPES)[index % len(SHAPES)]
     reference = describe(model, place_demonstration(case, shape, 7, query, goal_offset=GOAL, bulge=None))
-    field = encode(model, jnp.asarray(case.points_b))
+    field = encode(model, jax.device_put(case.points_b))
     arguments = {"goal": default_goal(field, reference), "energy": EnergyWeights()}
     return Problem(field, reference, arguments, OptimizeConfig())
 
@@ -84,7 +83,7 @@ def row_problem(model: Model, index: int) -> Problem:
     setting = dataclasses.replace(setting, trajectory=shape)
     scene = settings.scene(setting)
     reference = settings.aim(setting, describe(model, scene.demonstration))
-    field = encode(model, jnp.asarray(scene.points))
+    field = encode(model, jax.device_put(scene.points))
     arguments = {"goal": settings.goal(setting, field, reference), "energy": setting.energy}
     return Problem(field, reference, arguments, setting.optimiser)
 

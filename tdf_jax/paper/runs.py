@@ -121,7 +121,7 @@ def imitation(model: Model, setting: Setting) -> Run:
     """
     scene = settings.scene(setting)
     reference = describe(model, scene.demonstration)
-    field = encode(model, jnp.asarray(scene.points))
+    field = encode(model, jax.device_put(scene.points))
     goal = settings.goal(setting, field, reference)
     reference = settings.aim(setting, reference)
     key = jax.random.fold_in(jax.random.key(setting.seed), settings.STREAM + 1)

@@ -5,7 +5,6 @@ import functools
 from typing import Literal, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -206,7 +205,7 @@ def scene(setting: Setting) -> Scene:
         T_world_b[:3, 3] = setting.offset
     trajectory = demonstrated(setting, a.handle_frame, points_a.mean(axis=0))
     return Scene(
-        demonstration=Demonstration(jnp.asarray(points_a), trajectory, query(setting)),
+        demonstration=Demonstration(jax.device_put(points_a), trajectory, query(setting)),
         points=(points_b @ T_world_b[:3, :3].T + T_world_b[:3, 3]).astype(np.float32),
         T_world_target=T_world_b,
         T_world_places=(a.handle_frame, T_world_b @ b.handle_frame),
