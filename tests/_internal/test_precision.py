@@ -55,7 +55,10 @@ def problem(small_model):
 
 def test_a_program_without_it_is_as_the_device_likes():
     """The check below sees what it looks for."""
-    product = lambda x: jax.lax.fori_loop(0, 2, lambda _, y: y @ x, x)
+
+    def product(x):
+        return jax.lax.fori_loop(0, 2, lambda _, y: y @ x, x)
+
     assert precisions(product, jnp.eye(3)) == {None}
     assert precisions(full_precision(product), jnp.eye(3)) == {EXACT}
     with jax.default_matmul_precision("default"):
@@ -66,7 +69,10 @@ def test_fields_and_their_derivatives_are_exact(small_model, problem):
     points = jnp.asarray(random_cloud(0), jnp.float32)
     assert precisions(lambda points: tdf.encode(small_model, points), points) == {EXACT}
     field, reference, _ = problem
-    energy = lambda wxyz_xyz: tdf.trajectory_energy(tdf.Trajectory(wxyz_xyz), field, reference, tdf.EnergyWeights())
+
+    def energy(wxyz_xyz):
+        return tdf.trajectory_energy(tdf.Trajectory(wxyz_xyz), field, reference, tdf.EnergyWeights())
+
     assert precisions(jax.grad(energy), jnp.asarray(random_poses(1, 2), jnp.float32)) == {EXACT}
     with jax.default_matmul_precision("tensorfloat32"):
         assert precisions(field.descriptors, points) == {jax.lax.Precision.HIGH}
@@ -98,7 +104,10 @@ def test_training_is_as_fast_as_the_device_likes(small_model):
     shapes = (8, 3), (8,), (3,), (), (5, 3), (6, 5, 3)
     samples = [np.zeros((1, 2, *shape), np.float32) for shape in shapes]
     params = {"network": small_model.params, "frame": jnp.zeros((SMALL.latent, 3))}
-    gradient = lambda params: mean_gradient(params, SMALL, clouds.astype(np.float32), *samples)
+
+    def gradient(params):
+        return mean_gradient(params, SMALL, clouds.astype(np.float32), *samples)
+
     assert precisions(gradient, params) == {FAST}
     with jax.default_matmul_precision("highest"):
         assert precisions(gradient, params) == {EXACT}

@@ -278,6 +278,8 @@ def test_sampled_bottles_are_built_and_have_every_symmetry():
 
 
 RISE = "expected edge_radius, shoulder_bottom, shoulder_top and height to rise in this order"
+
+
 @pytest.mark.parametrize("change, message", [
     ({"height": -0.1}, "height is -0.1; expected a positive number"),
     ({"height": "tall"}, "height is 'tall'; expected a positive number"),

@@ -92,7 +92,7 @@ def rigid(x, y):
 
 
 def test_the_right_pose_is_the_same_place_of_the_partner_and_the_others_are_not(objects):
-    """Shown box and first offered box are rigid copies, related by place to place; places here are told apart by position."""
+    """The shown box and the first offered box are rigid copies from place to place; positions identify the places."""
     for sample, partner in pairs_of(drawn(objects, 2, pairs=8)):
         (index, size), (other, other_size) = source(objects, sample), source(objects, partner)
         T, left = rigid(sample["shown"], sample["offered"][0])
@@ -154,7 +154,7 @@ def test_validation_pairs_show_every_object_once_at_one_size(objects):
 
 
 def many(objects, folds, sources):
-    """The given objects over and over, with these symmetries and sources: what a batch asks of them does not depend on their shapes."""
+    """The given objects repeated, with these symmetries and sources; a batch does not depend on their shapes."""
     indices = np.resize(np.arange(len(objects.surface)), len(folds))
     repeated = {field.name: getattr(objects, field.name)[indices] for field in dataclasses.fields(DataSet)}
     return DataSet(**(repeated | {"fold": np.array(folds, np.int8), "source": np.array(sources)}))
@@ -226,7 +226,7 @@ def diagonal(monkeypatch):
 
 
 def least_distance(wrong, right, centre, fold):
-    """Root mean square distance of a pose's query points from where the right pose has them after any allowed turn about the object's axis."""
+    """RMS distance of a pose's query points from those of the nearest right pose, after any allowed turn."""
     angles = np.arange(fold or 720) * 2 * np.pi / (fold or 720)
     turns = Rotation.from_euler("z", angles[:, None]).as_matrix()
     copies = np.einsum("tij,pj->tpi", turns, right - centre) + centre
@@ -235,7 +235,7 @@ def least_distance(wrong, right, centre, fold):
 
 @pytest.mark.parametrize("fold", [0, 2, 4])
 def test_wrong_poses_are_wrong_for_every_turn_a_symmetry_allows(objects, diagonal, monkeypatch, fold):
-    """Poses on the axis are turned about it by any angle, some moved off as well: those that a symmetry makes right are not among the wrong ones."""
+    """Wrong poses are not equivalent to the right one, though all are turned about the axis and some moved off it."""
     monkeypatch.setattr(batch, "FIRST_SHARE", 0.0)  # of a mug, the place that is not on the axis
     monkeypatch.setattr(batch, "REMOTE_SHARE", 0.0)
     offered_turns = []
