@@ -9,6 +9,7 @@ import jax
 import tyro
 
 from tdf_jax._internal.errors import InputError
+from tdf_jax.landscape.storage import DEPRECATED_REDUCTIONS
 
 MEMORY = "error: out of memory; lower the number of starts, poses, query points or points, or raise the pitch"
 # each is a function in the module of its name
@@ -22,6 +23,8 @@ DEPRECATED_FLAGS = {
     "reproduce": {"--inits": "--num-starts", "--poses": "--num-poses", "--lever": "--rotation-scale"},
     "train": {"--poses": "--num-poses", "--network.asymmetry": "--network.symmetry-breaking-offset"},
 }
+# Choices of the release before by command and option; they are accepted for one release, with a warning.
+DEPRECATED_CHOICES = {"landscape": {"--reduce": DEPRECATED_REDUCTIONS}}
 STYLE = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)  # `--json` without `--no-json`, no word for "not given"
 
 
@@ -59,15 +62,23 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _current(arguments: Sequence[str]) -> list[str]:
-    """The arguments with today's names of options."""
+    """The arguments with today's names of options and choices."""
     new_names = DEPRECATED_FLAGS.get(arguments[0], {}) if arguments else {}
-    current = []
+    new_choices = DEPRECATED_CHOICES.get(arguments[0], {}) if arguments else {}
+    current, option = [], ""
     for word in arguments:
         name, equals, value = word.partition("=")
         if name in new_names:
             print(f"tdf: warning: {name} is deprecated; use {new_names[name]}", file=sys.stderr)
             name = new_names[name]
+        chosen = new_choices.get(name if equals else option, {})
+        choice = value if equals else name
+        if choice in chosen:
+            option = name if equals else option
+            print(f"tdf: warning: {option} {choice} is deprecated; use {option} {chosen[choice]}", file=sys.stderr)
+            name, value = (name, chosen[choice]) if equals else (chosen[choice], "")
         current.append(name + equals + value)
+        option = name
     return current
 
 

@@ -114,8 +114,8 @@ class LandscapeSettings(SceneSettings):
             the paper), the best of many at every point, or the best of rotations of the pick about an axis.
         rotations: number of orientations for "best" and "turns".
         axis: axis of "turns", world frame.
-        reduce: how the waypoints' energies are combined: the least, a soft least, each in its ring about the pick, or
-            the mean.
+        reduce: how the waypoints' energies are combined: the minimum, a soft minimum, each in its ring about the pick,
+            or the mean.
         sharpness: exponent of the energy in the cost of the lowest-cost path from the pick to the goal.
         no_page: write no landscape.html.
         out: folder of the results; an earlier result there is replaced.
@@ -134,7 +134,7 @@ class LandscapeSettings(SceneSettings):
     rotation: Literal["pick", "identity", "best", "turns"] = "pick"
     rotations: int = 24
     axis: Annotated[tuple[float, float, float], _option("X Y Z")] = (0.0, 0.0, 1.0)
-    reduce: Literal["least", "soft_least", "assigned", "mean"] = "least"
+    reduce: Literal["min", "softmin", "assigned", "mean"] = "min"
     sharpness: float = 1.0
     no_page: bool = False
     out: Annotated[Path, _option("DIR")] = Path("landscape")

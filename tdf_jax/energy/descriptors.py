@@ -1,4 +1,4 @@
-"""Descriptors of poses and trajectories: the point descriptors of the query points they carry."""
+"""Descriptors of poses and trajectories: the point descriptors of the query points at each pose (eq. 1)."""
 
 import jax
 from jaxtyping import Array, Float
@@ -15,9 +15,12 @@ def pose_descriptor(
     """F(T | P): descriptors of the query points at one pose.
 
     Args:
-        field: the object's.
-        T_world_query: pose of the query frame, `wxyz_xyz`.
-        query: points in the query frame, metres.
+        field: descriptor field of the object.
+        T_world_query: pose of the query frame, `wxyz_xyz`, (7,), metres, world frame.
+        query: query points, (queries, 3), metres, query frame.
+
+    Returns:
+        One descriptor for each query point, (queries, channels).
 
     Raises:
         InputError: query points that are not (queries, 3) and finite.
@@ -32,8 +35,14 @@ def trajectory_descriptor(
     """phi(T | P): pose descriptors of every waypoint (eq. 1 of the TDF paper).
 
     Args:
-        field: the object's.
-        trajectory: poses of the query frame.
-        query: points in the query frame, metres.
+        field: descriptor field of the object.
+        trajectory: poses of the query frame, T_world_query.
+        query: query points, (queries, 3), metres, query frame.
+
+    Returns:
+        One descriptor for each waypoint and query point, (poses, queries, channels).
+
+    Raises:
+        InputError: query points that are not (queries, 3) and finite.
     """
     return jax.lax.map(lambda T_world_query: pose_descriptor(field, T_world_query, query), trajectory.wxyz_xyz)

@@ -1,4 +1,4 @@
-"""A demonstration, and the reference that an imitation is compared with."""
+"""The reference that an imitation is compared with: the descriptors of one or several demonstrations."""
 
 import dataclasses
 import functools
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.descriptors import trajectory_descriptor
 from tdf_jax.geometry.demonstration import Demonstration
@@ -22,12 +23,13 @@ COMBINATIONS = ("mean", "median")
 @functools.partial(jax.tree_util.register_dataclass, data_fields=["descriptors", "trajectory", "query"], meta_fields=[])
 @dataclasses.dataclass(frozen=True)
 class Reference:
-    """What one or several demonstrations ask for, on any object of the category.
+    """Descriptors and poses of one or several demonstrations.
 
     Attributes:
-        descriptors: phi of the demonstration, (poses, queries, channels); of several, their mean or median.
-        trajectory: T_object_query, relative to the demonstration's centroid with world axes; of several, the first's.
-        query: query points in the query frame, metres.
+        descriptors: phi of the demonstration, or the mean or median over demonstrations, (poses, queries, channels).
+        trajectory: poses T_object_query of the first demonstration, metres; the object frame has its origin at the
+            centroid of the demonstrated cloud and the axes of the world.
+        query: query points, (queries, 3), metres, query frame.
     """
 
     descriptors: Float[Array, "poses queries channels"]
@@ -39,21 +41,20 @@ def describe(model: Model, demonstrations: Demonstration | Sequence[Demonstratio
     """Encode one or several demonstrations.
 
     Args:
-        model: the network.
-        demonstrations: one, or several with the same query points and number of poses.
-        combine: what is taken of several descriptors of a query point, channel by channel: their "mean", as in NDF, or
-            their "median", which has the least sum of the absolute differences that eq. 2 counts
-            (docs/results/benchmark.md compares).
+        model: network that encodes the demonstrated objects.
+        demonstrations: one demonstration, or several with the same query points and number of poses.
+        combine: how the descriptors of several demonstrations are combined, channel by channel: "mean", as in NDF, or
+            "median", which minimises the sum of absolute differences of eq. 2 (docs/results/benchmark.md compares
+            them).
 
     Returns:
         The reference.
 
     Raises:
-        InputError: no demonstration, something else, demonstrations that differ in query points or number of poses, or
-            an unknown combination.
+        InputError: there is no demonstration, an argument is not a `Demonstration`, demonstrations differ in query
+            points or number of poses, or `combine` is unknown.
     """
-    if combine not in COMBINATIONS:
-        raise InputError(f"describe(): combine is {combine!r}; expected one of {', '.join(COMBINATIONS)}")
+    checks.choice("describe()", "combine", combine, COMBINATIONS)
     demonstrations = list(demonstrations) if isinstance(demonstrations, Iterable) else [demonstrations]
     kinds = sorted({type(demo).__name__ for demo in demonstrations})
     if kinds != ["Demonstration"]:
@@ -63,12 +64,14 @@ def describe(model: Model, demonstrations: Demonstration | Sequence[Demonstratio
         if other.trajectory.num_poses != first.trajectory.num_poses or not np.array_equal(other.query, first.query):
             raise InputError(
                 "describe(): demonstrations differ in their query points or number of poses; expected the same. "
-                "Use one query set and resample() the trajectories"
+                "Use one set of query points, and resample() the trajectories"
             )
     query = jnp.asarray(first.query)
     fields = [encode(model, demo.points) for demo in demonstrations]
     several = [_describe(field, demo.trajectory, query) for field, demo in zip(fields, demonstrations)]
-    descriptors = sum(several) / len(several) if combine == "mean" else jnp.median(jnp.stack(several), axis=0)
+    descriptors = (
+        sum(several[1:], several[0]) / len(several) if combine == "mean" else jnp.median(jnp.stack(several), axis=0)
+    )
     return Reference(descriptors, first.trajectory.shifted(-fields[0].origin), query)
 
 

@@ -1,4 +1,4 @@
-"""Sweeping the query frame over a grid, in one orientation or many: from a field and a reference to a landscape (eq. 4 of the TDF paper)."""
+"""Sweeps of the query frame over a grid, in one orientation or many (eq. 4 of the TDF paper)."""
 
 from collections.abc import Callable, Iterator
 
@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from tdf_jax._internal import checks
 from tdf_jax._internal.deprecation import renamed_keywords
 from tdf_jax._internal.devices import check_device_mesh
 from tdf_jax._internal.errors import InputError
@@ -14,11 +15,10 @@ from tdf_jax.energy.reference import Reference
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.grid import Grid
 from tdf_jax.landscape import shared_lattice
-from tdf_jax.landscape.storage import TEMPERATURE, Landscape
+from tdf_jax.landscape.storage import TEMPERATURE, Landscape, check_reduction
 from tdf_jax.networks.field import DescriptorField
 
 OVER_ROTATIONS = ("best", "each")
-ORTHOGONAL = 1e-4  # how far R R^T may be from the identity
 
 
 @renamed_keywords(mesh="device_mesh")
@@ -27,7 +27,7 @@ def energy_landscape(
     reference: Reference,
     grid: Grid,
     rotation: Float[Array, "*rotations 3 3"] | None = None,
-    reduce: str = "least",
+    reduce: str = "min",
     *,
     over_rotations: str = "best",
     temperature: float = TEMPERATURE,
@@ -37,29 +37,36 @@ def energy_landscape(
 ) -> Landscape:
     """Sweep the query frame over a grid.
 
-    A point of the field is evaluated once for all waypoints, and once for all query points that meet there: where the
-    query is a lattice with the grid's steps along the grid's axes (`lattice_query`, `snapped_query`), tens of times
-    less work than one by one. The memory at work does not grow with the grid, only with the references: 8 kB for each
-    query point and waypoint, twice.
+    The field is evaluated once at a point for all waypoints, and for all query points that share the point. If the
+    query points are a lattice with the grid's steps along the grid's axes (`lattice_query`, `snapped_query`), this
+    saves most of the work (docs/guide/landscape.md). The working memory grows with the number of query points and
+    waypoints, but not with the grid.
 
     Args:
-        field: the object's.
-        reference: the demonstration's; waypoints may be of several.
+        field: descriptor field of the object.
+        reference: the demonstration; its waypoints may be those of several trajectories.
         grid: positions of the query frame's origin.
-        rotation: orientation R_world_query, or several (rotations, 3, 3), such as `se3.rotation_grid` or
-            `se3.turns` give; by default the world's axes, as in the paper.
-        reduce: how waypoints are combined, see `Landscape.combined`.
-        over_rotations: of several rotations, keep the "best" at every point and for every waypoint, or "each".
-        temperature: of the soft least, in units of the energy.
-        share: False evaluates every (grid point, query point) by itself, to compare.
-        device_mesh: devices to share the grid's tiles, of this process or of several that make the same call; see
-            docs/guide/scaling.md.
-        progress: called with the number of tiles done and of all.
+        rotation: orientation R_world_query, (3, 3), or several, (rotations, 3, 3), such as `tdf_jax.rotation_grid` or
+            `tdf_jax.turns` give; by default the axes of the world, as in the paper.
+        reduce: how the energies of the waypoints are combined: "min", "softmin", "assigned" or "mean", see
+            `Landscape.combined`.
+        over_rotations: "best" takes the minimum over rotations at every point and for every waypoint; "each" gives the
+            energies of every rotation.
+        temperature: temperature of the softmin, an energy.
+        share: False evaluates each pair of a grid point and a query point separately, for comparisons.
+        device_mesh: devices that share the tiles of the grid, of this process or of several that make the same call;
+            see docs/guide/scaling.md.
+        progress: function of the number of finished tiles and the number of all tiles, called after each tile.
+
+    Returns:
+        The landscape.
 
     Raises:
-        InputError: rotations that are none, an unknown choice, a device_mesh of another type, or a reference from another
-            network than the field.
+        InputError: `rotation` has no rotations, a choice is unknown, `device_mesh` has another type, or reference and
+            field are from different networks.
     """
+    # The level of the caller counts the decorator.
+    reduce = check_reduction("energy_landscape()", reduce, stacklevel=5)
     landscape = blank(field, reference, grid, rotation, reduce, over_rotations=over_rotations, temperature=temperature)
     for done, total in fill(landscape, field, reference, share=share, device_mesh=device_mesh):
         if progress is not None:
@@ -72,33 +79,26 @@ def blank(
     reference: Reference,
     grid: Grid,
     rotation: Float[Array, "*rotations 3 3"] | None = None,
-    reduce: str = "least",
+    reduce: str = "min",
     *,
     over_rotations: str = "best",
     temperature: float = TEMPERATURE,
 ) -> Landscape:
-    """A landscape with NaN for all energies, to `fill`; arguments and errors as `energy_landscape`."""
+    """Make a landscape whose energies are all NaN, for `fill`; see `energy_landscape` for the arguments."""
     channels = field.conditioned.config.channels
     if reference.descriptors.shape[-1] != channels:
         raise InputError(
-            f"energy_landscape(): the reference has {reference.descriptors.shape[-1]} channels and the field {channels}; "
-            "expected both from the same model"
+            f"energy_landscape(): the reference has {reference.descriptors.shape[-1]} channels and the field "
+            f"{channels}; expected both from the same model"
         )
-    if over_rotations not in OVER_ROTATIONS:
-        raise InputError(
-            f"energy_landscape(): over_rotations is {over_rotations!r}; expected one of {', '.join(OVER_ROTATIONS)}"
-        )
+    checks.choice("energy_landscape()", "over_rotations", over_rotations, OVER_ROTATIONS)
     rotations = np.asarray(np.eye(3) if rotation is None else rotation, dtype=float)
     if rotations.shape[-2:] != (3, 3) or rotations.ndim not in (2, 3) or not len(rotations):
         raise InputError(
             f"energy_landscape(): rotation has shape {rotations.shape}; expected (3, 3), or several (rotations, 3, 3)"
         )
     rotations = rotations.reshape(-1, 3, 3)
-    square = np.allclose(rotations @ rotations.swapaxes(1, 2), np.eye(3), atol=ORTHOGONAL)
-    if not square or (np.linalg.det(rotations) < 0).any():
-        raise InputError(
-            "energy_landscape(): rotation holds matrices that are no rotations; expected R R^T = I and no mirror image"
-        )
+    checks.rotations("energy_landscape()", "rotation", rotations)
     count = len(reference.descriptors)
     shape = (count, *(() if over_rotations == "best" else (len(rotations),)), *grid.shape)
     waypoints = np.asarray(reference.trajectory.translations + field.origin)
@@ -116,43 +116,47 @@ def fill(
     share: bool = True,
     device_mesh: jax.sharding.Mesh | None = None,
 ) -> Iterator[tuple[int, int]]:
-    """Sweep a landscape from `blank` in place, tile by tile, so that what is finished can be looked at, kept, and gone on from.
+    """Sweep a landscape from `blank` in place, part by part, so that an interrupted sweep can be saved and continued.
 
     Args:
-        landscape: with the first `done` parts finished.
-        field, reference: as it was made with.
-        done: parts to leave out, as this function counted them.
-        share, device_mesh: see `energy_landscape`.
+        landscape: landscape whose first `done` parts are finished.
+        field: descriptor field that the landscape was made with.
+        reference: reference that the landscape was made with.
+        done: number of finished parts, as a previous call counted them; they are skipped.
+        share: see `energy_landscape`.
+        device_mesh: see `energy_landscape`.
 
     Yields:
-        The number of parts done and of all: tiles of the grid, one rotation after the other.
+        The number of finished parts and the number of all parts: tiles of the grid, one rotation after the other.
     """
     check_device_mesh("energy_landscape()", device_mesh)
     grid, query = landscape.grid, np.asarray(reference.query, dtype=float)
-    found = [shared_lattice.layers(grid, query @ R.T, share) for R in landscape.rotations]
-    cover = [shared_lattice.tiles(grid, each.span) for each in found]
-    total = sum(map(len, cover))
+    layers = [shared_lattice.layers(grid, query @ R.T, share) for R in landscape.rotations]
+    tiles = [shared_lattice.tiles(grid, each.span) for each in layers]
+    total = sum(map(len, tiles))
     before = 0
-    for index, (layers, tiles) in enumerate(zip(found, cover)):
-        left = tiles[max(done - before, 0) :]
-        before += len(tiles)
-        for tile, values in shared_lattice.swept(field, reference.descriptors, grid, layers, left, device_mesh):
-            _keep(landscape, index, tile.within(grid.shape), values)
+    for index, (own_layers, own_tiles) in enumerate(zip(layers, tiles)):
+        remaining = own_tiles[max(done - before, 0) :]
+        before += len(own_tiles)
+        sweep = shared_lattice.tile_energies(field, reference.descriptors, grid, own_layers, remaining, device_mesh)
+        for tile, values in sweep:
+            _enter(landscape, index, tile.within(grid.shape), values)
             done += 1
             yield done, total
 
 
-def _keep(landscape, index, part, values):
-    """Enter one rotation's energies at one part of the grid."""
+def _enter(landscape, index, part, values):
+    """Enter the energies of one rotation at one part of the grid."""
     if landscape.grid.mask is not None:
         values = np.where(landscape.grid.mask[part], values, np.nan)
     if landscape.turned is None:
         landscape.values[:, index, *part] = values
         return
-    kept, turned = landscape.values[:, *part], landscape.turned[:, *part]
-    better = ~(kept <= values)  # also where there is none yet
-    turned[better] = index  # first: interrupted here, the point would be entered again, with its rotation
-    kept[better] = values[better]
+    lowest, best = landscape.values[:, *part], landscape.turned[:, *part]
+    better = ~(lowest <= values)  # also true where `lowest` is still NaN
+    # The rotation is written first: after an interruption between both lines, the part is entered again.
+    best[better] = index
+    lowest[better] = values[better]
 
 
 def query_change(
@@ -164,35 +168,39 @@ def query_change(
     samples: int = 64,
     seed: int = 0,
 ) -> tuple[float, float]:
-    """What another query set does to the energies: median and largest relative difference at random points of a grid.
+    """Compare the energies of two sets of query points at random points of a grid.
 
     Args:
-        field: the object's.
-        reference: the demonstration's, with the query set as it was.
-        changed: the same demonstration's, with the other query set, such as the one snapped onto the grid's lattice.
-        grid: where.
-        rotation: orientation R_world_query; by default the world's axes.
-        samples: points.
-        seed: of their draw.
+        field: descriptor field of the object.
+        reference: the demonstration with the first set of query points.
+        changed: the same demonstration with the second set, such as the first one snapped onto the grid's lattice.
+        grid: positions of the query frame's origin.
+        rotation: orientation R_world_query, (3, 3); by default the axes of the world.
+        samples: number of random points of the grid.
+        seed: seed of the random points.
+
+    Returns:
+        The median and the largest relative difference of the energies.
     """
     rng = np.random.default_rng(seed)
-    places = np.argwhere(np.ones(grid.shape, bool) if grid.mask is None else grid.mask)
-    chosen = places[rng.integers(len(places), size=samples)]
+    nodes = np.argwhere(np.ones(grid.shape, bool) if grid.mask is None else grid.mask)
+    chosen = nodes[rng.integers(len(nodes), size=samples)]
     points = jnp.asarray(grid.first + chosen @ (grid.steps[:, None] * grid.directions), field.origin.dtype)
     R = jnp.eye(3) if rotation is None else jnp.asarray(rotation)
     before, after = (
-        np.asarray(_at(field, one.descriptors, se3.rotate(R, one.query), points)) for one in (reference, changed)
+        np.asarray(_energies_at(field, one.descriptors, se3.rotate(R, one.query), points))
+        for one in (reference, changed)
     )
-    apart = np.abs(after - before) / before
-    return float(np.median(apart)), float(apart.max())
+    change = np.abs(after - before) / before
+    return float(np.median(change)), float(change.max())
 
 
 @jax.jit
-def _at(field, descriptors, offsets, points):
-    """Energies (points, waypoints)."""
+def _energies_at(field, descriptors, offsets, points):
+    """Energies of every waypoint at single points, (points, waypoints)."""
 
-    def one(x):
+    def energies(x):
         here = field.descriptors(offsets + x)
-        return jax.lax.map(lambda there: jnp.mean(jnp.abs(here - there)), descriptors)
+        return jax.lax.map(lambda reference: jnp.mean(jnp.abs(here - reference)), descriptors)
 
-    return jax.lax.map(one, points)
+    return jax.lax.map(energies, points)

@@ -7,81 +7,86 @@ from jaxtyping import Float
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.landscape.storage import Landscape
 
-SHARPEST = 50.0  # energies differ by a factor of 10 or so: costs then span as many decades, and float64 holds 300
+SHARPEST = 50.0  # energies differ by a factor of about 10, so costs span 50 decades of the 300 of float64
 
 
 def lowest_cost_path(
     landscape: Landscape, start: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"], sharpness: float = 1.0
 ) -> Float[np.ndarray, "corners 3"]:
-    """The path from start to goal along which the integral of energy^sharpness over length is least.
+    """Compute the path from start to goal that minimises the integral of energy^sharpness over its length.
 
-    Dijkstra's algorithm (scipy) over the points that count, each joined to all its neighbours, diagonal ones included;
-    a step costs its length times the mean of both ends' energy^sharpness. Memory grows with the points: by estimate 1
-    kB each. A step of the grid is the resolution, and directions are multiples of 45 degrees.
+    The graph of Dijkstra's algorithm (scipy) joins each point of the grid to all its neighbours, also diagonally. A
+    step costs its length times the mean of energy^sharpness at its ends. The step of the grid is the resolution, and
+    directions are multiples of 45 degrees. Memory grows with the number of points
+    (docs/results/code_notes.md#landscapeshortest_path).
 
     Args:
-        landscape: in one orientation, or the best of several.
-        start, goal: metres, world frame; the path goes between the grid's points nearest to them.
-        sharpness: 0 to 50; 0 gives the shortest path; the larger, the more of a detour a valley is worth.
+        landscape: landscape in one orientation, or in the best of several.
+        start: start of the path, (3,), metres, world frame; the path begins at the nearest point of the grid.
+        goal: end of the path, (3,), metres, world frame; the path ends at the nearest point of the grid.
+        sharpness: exponent of the energy, 0 to 50; 0 gives the shortest path, and larger exponents allow longer detours
+            through valleys.
 
     Returns:
-        Points of the grid from start to goal, metres, world frame.
+        Points of the grid from start to goal, (corners, 3), metres, world frame.
 
     Raises:
-        InputError: each rotation's energies were kept, an end is no point or lies more than a step outside the grid,
-            the sharpness is not in 0 to 50, or the points that count do not join both ends.
+        InputError: the landscape has the energies of every rotation, an end is not a finite point or lies more than a
+            step outside the grid, the sharpness is not in 0 to 50, or no path inside the grid's mask joins both ends.
     """
     if landscape.turned is None:
         raise InputError(
-            "lowest_cost_path(): the landscape keeps each rotation's energies; expected the best, or one rotation's"
+            "lowest_cost_path(): the landscape has the energies of every rotation; expected those of the best, or of "
+            "one. Use over_rotations='best'"
         )
-    if not 0 <= sharpness <= SHARPEST:
-        raise InputError(f"lowest_cost_path(): sharpness is {sharpness}; expected 0 to {SHARPEST:g}")
+    checks.number("lowest_cost_path()", "sharpness", sharpness, least=0, most=SHARPEST)
     grid, energy = landscape.grid, landscape.combined
     points = grid.points.reshape(-1, 3)
-    counts = np.isfinite(energy)
-    ends = [_nearest(name, grid, points, counts, end) for name, end in (("start", start), ("goal", goal))]
-    # Over the least energy: powers of numbers near 0.002 would fall out of the range of what can be told apart.
-    cost = np.where(counts, energy / np.nanmin(energy[energy > 0], initial=np.inf), np.inf).astype(float) ** sharpness
-    _, before = dijkstra(_graph(grid, cost, counts), indices=ends[0], return_predecessors=True)
+    used = np.isfinite(energy)
+    ends = [_nearest(name, grid, points, used, end) for name, end in (("start", start), ("goal", goal))]
+    # The energy is divided by its minimum, because powers of energies near 0.002 would underflow.
+    cost = np.where(used, energy / np.nanmin(energy[energy > 0], initial=np.inf), np.inf).astype(float) ** sharpness
+    _, before = dijkstra(_graph(grid, cost, used), indices=ends[0], return_predecessors=True)
     path = [ends[1]]
     while path[-1] != ends[0]:
         if before[path[-1]] < 0:
             raise InputError(
-                "lowest_cost_path(): the grid's points that count do not join start and goal; expected a grid with both in one piece"
+                "lowest_cost_path(): no path inside the grid's mask joins start and goal; expected both in one "
+                "connected part of the grid"
             )
         path.append(before[path[-1]])
     return points[path[::-1]]
 
 
-def _nearest(name, grid, points, counts, end):
-    end = np.asarray(end, dtype=float)
-    if end.shape != (3,) or not np.isfinite(end).all():
-        raise InputError(f"lowest_cost_path(): {name} is {end.tolist()}; expected three finite numbers, metres")
-    apart = np.where(counts.ravel(), np.linalg.norm(points - end, axis=1), np.inf)
-    if apart.min() > np.linalg.norm(grid.steps):
+def _nearest(name, grid, points, used, end):
+    """Index of the grid point nearest to an end of the path."""
+    end = np.asarray(checks.vector("lowest_cost_path()", name, end))
+    distances = np.where(used.ravel(), np.linalg.norm(points - end, axis=1), np.inf)
+    if distances.min() > np.linalg.norm(grid.steps):
         raise InputError(
-            f"lowest_cost_path(): {name} {end.tolist()} lies {apart.min():.3f} m from the grid's nearest point; expected it inside"
+            f"lowest_cost_path(): {name} {end.tolist()} lies {distances.min():.3f} m from the nearest point of the "
+            "grid; expected a point inside the grid"
         )
-    return int(apart.argmin())
+    return int(distances.argmin())
 
 
-def _graph(grid, cost, counts):
-    """Costs of steps between neighbours, each pair once in both directions."""
+def _graph(grid, cost, used):
+    """Sparse matrix of the costs of steps between neighbours, in both directions."""
     numbers = np.arange(cost.size).reshape(grid.shape)
     rows, columns, costs = [], [], []
-    for move in itertools.product((-1, 0, 1), repeat=len(grid.shape)):
-        if move <= (0,) * len(move):
-            continue  # half of the moves: the others are the same steps backwards
-        here = tuple(slice(max(-m, 0), size - max(m, 0)) for m, size in zip(move, grid.shape))
-        there = tuple(slice(max(m, 0), size - max(-m, 0)) for m, size in zip(move, grid.shape))
-        both = counts[here] & counts[there]
+    for step in itertools.product((-1, 0, 1), repeat=len(grid.shape)):
+        if step <= (0,) * len(step):
+            continue  # the other half of the steps are the same ones backwards, and no step at all
+        here = tuple(slice(max(-move, 0), size - max(move, 0)) for move, size in zip(step, grid.shape))
+        there = tuple(slice(max(move, 0), size - max(-move, 0)) for move, size in zip(step, grid.shape))
+        both = used[here] & used[there]
         rows.append(numbers[here][both])
         columns.append(numbers[there][both])
-        costs.append(np.linalg.norm(move * grid.steps) * (cost[here][both] + cost[there][both]) / 2)
+        costs.append(np.linalg.norm(step * grid.steps) * (cost[here][both] + cost[there][both]) / 2)
     rows, columns, costs = map(np.concatenate, (rows, columns, costs))
     both_ways = np.concatenate([rows, columns]), np.concatenate([columns, rows])
     return coo_array((np.tile(costs, 2), both_ways), shape=(cost.size, cost.size)).tocsr()

@@ -1,36 +1,44 @@
-"""The energy field of eq. 4 over a grid: every waypoint's descriptor loss with the query frame at each of its points."""
+"""The energy field of eq. 4 over a grid, and its file: each waypoint's descriptor loss at every point of the grid."""
 
 import dataclasses
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from tdf_jax._internal import checks
+from tdf_jax._internal.deprecation import warn
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
 from tdf_jax.geometry.grid import Grid
 
-REDUCTIONS = ("least", "soft_least", "assigned", "mean")
-TEMPERATURE = 5e-4  # of the soft least; a waypoint's energy is some 0.002 where it is met and 0.01 far away
-FORMAT = 1  # of files; raised when a field changes its meaning or goes
+REDUCTIONS = ("min", "softmin", "assigned", "mean")
+# Choices of the release before; they are accepted for one release, with a DeprecationWarning.
+DEPRECATED_REDUCTIONS = {"least": "min", "soft_least": "softmin"}
+TEMPERATURE = 5e-4  # of the softmin; the energy of a waypoint is about 0.002 at a match and 0.01 far away
+FORMAT = 1  # of files; raised if a field is removed or its meaning changes
 FRAME = "world"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Landscape:
-    """Energies over a grid of the world; NaN where the grid's mask is false.
+    """Energies over a grid; they are NaN where the grid's mask is false.
 
     Attributes:
-        grid: where.
-        values: every waypoint's part of eq. 2 with the query frame's origin at the grid's points: (poses, *grid.shape),
-            the least over `rotations`, or (poses, rotations, *grid.shape) if each was kept.
-        waypoints: the demonstration's positions, its centroid moved to the object's, metres.
+        grid: positions of the query frame's origin.
+        values: each waypoint's part of eq. 2 with the query frame's origin at each point of the grid: the minimum over
+            `rotations`, (poses, *grid.shape), or the energies of every rotation, (poses, rotations, *grid.shape).
+        waypoints: positions of the demonstration, moved with the object's centroid, (poses, 3), metres, world frame.
         rotations: orientations R_world_query of the sweep, (rotations, 3, 3).
-        turned: which rotation has the least energy, as `values`; None if each was kept.
-        reduce: how `combined` comes from `values`, one of `REDUCTIONS`.
-        temperature: of the soft least, in units of the energy.
+        turned: index of the rotation with the lowest energy, (poses, *grid.shape); None if `values` has every rotation.
+        reduce: how `combined` reduces `values` over waypoints, one of `REDUCTIONS`.
+        temperature: temperature of the softmin, an energy.
+
+    Raises:
+        InputError: `reduce` is unknown, the temperature is not above 0, or the shapes do not match.
     """
 
     grid: Grid
@@ -38,37 +46,35 @@ class Landscape:
     waypoints: Float[np.ndarray, "poses 3"]
     rotations: Float[np.ndarray, "rotations 3 3"]
     turned: Int[np.ndarray, " poses *shape"] | None = None
-    reduce: str = "least"
+    reduce: str = "min"
     temperature: float = TEMPERATURE
 
     def __post_init__(self):
-        if self.reduce not in REDUCTIONS:
-            raise InputError(f"Landscape(): reduce is {self.reduce!r}; expected one of {', '.join(REDUCTIONS)}")
-        if not 0 < self.temperature < np.inf:
-            raise InputError(f"Landscape(): temperature is {self.temperature}; expected an energy above 0")
+        # The level of the caller counts the constructor that the dataclass generates.
+        object.__setattr__(self, "reduce", check_reduction("Landscape()", self.reduce, stacklevel=5))
+        checks.positive("Landscape()", "temperature", self.temperature, unit="an energy")
         shape = (len(self.waypoints), *self.grid.shape)
         each = (len(self.waypoints), len(self.rotations), *self.grid.shape)
         if self.values.shape != (shape if self.turned is not None else each):
             raise InputError(
-                f"Landscape(): values have shape {self.values.shape}; expected {each}, or {shape} with the rotation of each in `turned`"
+                f"Landscape(): values have shape {self.values.shape}; expected {each}, or {shape} with the "
+                "index of the best rotation in `turned`"
             )
 
     @property
     def combined(self) -> Float[np.ndarray, "*shape"]:
-        """E(x), one energy of all waypoints at a point; for each rotation if each was kept.
+        """E(x): one energy for all waypoints, (*grid.shape); with all rotations, (rotations, *grid.shape).
 
-        - "least": the least of the waypoints' energies.
-        - "soft_least": -T log(mean exp(-E_i / T)), T the temperature: between the least and the mean, and smooth.
-        - "assigned": the energy of the waypoint whose distance from the first one is nearest to the point's: rings, as
-        in the paper's
-          figures.
-        - "mean": the mean, eq. 2 of a trajectory whose waypoints all stand there.
+        - "min": the minimum of the waypoints' energies.
+        - "softmin": -T log(mean exp(-E_i / T)) with the temperature T, which is smooth, and between minimum and mean.
+        - "assigned": the energy of the waypoint to which `rings` assigns the point, as in the paper's figures.
+        - "mean": the mean, which is eq. 2 of a trajectory with all its waypoints at the point.
         """
         if self.reduce == "mean":
             return self.values.mean(axis=0)
-        if self.reduce == "soft_least":
-            least = self.values.min(axis=0)
-            return least - self.temperature * np.log(np.mean(np.exp((least - self.values) / self.temperature), axis=0))
+        if self.reduce == "softmin":
+            low = self.values.min(axis=0)
+            return low - self.temperature * np.log(np.mean(np.exp((low - self.values) / self.temperature), axis=0))
         if self.reduce == "assigned":
             ring = self.rings
             if self.values.ndim > ring.ndim + 1:
@@ -78,19 +84,22 @@ class Landscape:
 
     @property
     def rings(self) -> Int[np.ndarray, "*shape"]:
-        """Which waypoint every point is assigned to: the one as far from the first waypoint as the point is, or nearest to that."""
+        """Index of the waypoint that each point is assigned to, (*grid.shape).
+
+        It is the waypoint whose distance from the first waypoint is nearest to the point's distance from it.
+        """
         first = self.waypoints[0]
-        apart = np.linalg.norm(self.grid.points - first, axis=-1)
-        return np.abs(apart[..., None] - np.linalg.norm(self.waypoints - first, axis=-1)).argmin(axis=-1)
+        distances = np.linalg.norm(self.grid.points - first, axis=-1)
+        return np.abs(distances[..., None] - np.linalg.norm(self.waypoints - first, axis=-1)).argmin(axis=-1)
 
     @property
     def minimisers(self) -> Float[np.ndarray, "poses 3"]:
-        """x_i* of eq. 5: the grid's point where each waypoint's energy is least, metres, world frame."""
+        """x_i* of eq. 5: the grid point with the lowest energy of each waypoint, (poses, 3), metres, world frame."""
         return self.grid.points.reshape(-1, 3)[self._best[1]]
 
     @property
     def minimiser_rotations(self) -> Float[np.ndarray, "poses 3 3"]:
-        """The orientation R_world_query of each minimiser."""
+        """Orientation R_world_query of each minimiser, (poses, 3, 3)."""
         rotation, point = self._best
         if self.turned is not None:
             rotation = np.take_along_axis(self.turned.reshape(len(self.values), -1), point[:, None], axis=1)[:, 0]
@@ -98,18 +107,38 @@ class Landscape:
 
     @property
     def _best(self):
-        """Indices of each waypoint's least energy: of the rotation, if each was kept, and of the point."""
+        """Indices of each waypoint's lowest energy: of the rotation (0 if `values` has one), and of the point."""
         flat = self.values.reshape(len(self.values), -1)
         return np.divmod(np.nanargmin(flat, axis=1), int(np.prod(self.grid.shape)))
 
 
-def save_landscape(path: str | os.PathLike, landscape: Landscape, about: dict | None = None) -> None:
-    """Write a landscape to an .npz file: its arrays, and a JSON header that says what they are.
+def check_reduction(function: str, reduce: str, stacklevel: int) -> str:
+    """Check how waypoints are reduced, and replace a deprecated choice.
 
     Args:
-        path: the file; it appears only once it is whole.
-        landscape: what to write.
-        about: anything else for the header that JSON can hold, such as the settings it was made with.
+        function: name that the error message begins with.
+        reduce: one of `REDUCTIONS`, or a choice of the release before.
+        stacklevel: level of the caller who chose it, as for `warnings.warn` called in `tdf_jax._internal.deprecation`.
+
+    Returns:
+        One of `REDUCTIONS`.
+
+    Raises:
+        InputError: the choice is unknown.
+    """
+    if isinstance(reduce, str) and reduce in DEPRECATED_REDUCTIONS:
+        warn(f"{function[:-1]}reduce={reduce!r})", f"reduce={DEPRECATED_REDUCTIONS[reduce]!r}", stacklevel)
+        return DEPRECATED_REDUCTIONS[reduce]
+    return checks.choice(function, "reduce", reduce, REDUCTIONS)
+
+
+def save_landscape(path: str | os.PathLike, landscape: Landscape, about: dict | None = None) -> None:
+    """Write a landscape to an .npz file: its arrays, and a JSON header that describes them.
+
+    Args:
+        path: the file, in an existing folder; it appears only once it is complete.
+        landscape: the landscape.
+        about: other data for the header, in types of JSON, such as the settings of the sweep.
 
     Raises:
         InputError: the file cannot be written, or its name does not end in .npz.
@@ -123,7 +152,11 @@ def save_landscape(path: str | os.PathLike, landscape: Landscape, about: dict | 
         "reduce": landscape.reduce,
         "temperature": landscape.temperature,
     }
-    arrays = {"values": landscape.values, "waypoints": landscape.waypoints, "rotations": landscape.rotations}
+    arrays: dict[str, Any] = {
+        "values": landscape.values,
+        "waypoints": landscape.waypoints,
+        "rotations": landscape.rotations,
+    }
     arrays |= {"origin": grid.origin, "directions": grid.directions}
     arrays |= {f"coordinates_{axis}": steps for axis, steps in enumerate(grid.coordinates)}
     arrays |= {"turned": landscape.turned} if landscape.turned is not None else {}
@@ -133,16 +166,16 @@ def save_landscape(path: str | os.PathLike, landscape: Landscape, about: dict | 
 
 
 def load_landscape(path: str | os.PathLike) -> tuple[Landscape, dict]:
-    """Read what `save_landscape` wrote.
+    """Read a file of `save_landscape`, also of the release before.
 
     Args:
         path: the file.
 
     Returns:
-        The landscape, and what was said about it.
+        The landscape, and the `about` of `save_landscape`.
 
     Raises:
-        InputError: there is no such file, or it holds something else or is damaged.
+        InputError: the file does not exist, holds something else or is damaged.
     """
     path = _npz("load_landscape", path)
     try:
@@ -151,22 +184,24 @@ def load_landscape(path: str | os.PathLike) -> tuple[Landscape, dict]:
         header = json.loads(str(arrays.pop("header")))
         if header["format"] != FORMAT:
             raise InputError(
-                f"load_landscape(): {path} has format {header['format']}; expected {FORMAT}: make it again"
+                f"load_landscape(): {path} has format {header['format']}; expected {FORMAT}: compute it again"
             )
         axes = tuple(arrays[f"coordinates_{axis}"] for axis in range(len(arrays["directions"])))
         grid = Grid(arrays["origin"], arrays["directions"], axes, arrays.get("mask"))
         fields = {name: arrays[name] for name in ("values", "waypoints", "rotations")}
-        found = Landscape(
-            grid, **fields, turned=arrays.get("turned"), reduce=header["reduce"], temperature=header["temperature"]
+        reduce = header["reduce"]
+        reduce = DEPRECATED_REDUCTIONS[reduce] if reduce in DEPRECATED_REDUCTIONS else reduce
+        landscape = Landscape(
+            grid, **fields, turned=arrays.get("turned"), reduce=reduce, temperature=header["temperature"]
         )
-        return found, header["about"]
+        return landscape, header["about"]
     except FileNotFoundError:
         raise InputError(
             f"load_landscape(): there is no file {path}; expected one from save_landscape or `tdf landscape`"
         ) from None
     except InputError:
         raise
-    except Exception as error:  # a damaged archive raises one of a dozen kinds
+    except Exception as error:  # a damaged archive raises errors of many kinds
         raise InputError(
             f"load_landscape(): cannot read {path} ({error}); expected a file from save_landscape"
         ) from None

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +17,7 @@ from tdf_jax.networks.model import Model
 from tdf_jax.paper import setting as settings
 from tdf_jax.paper.setting import SHAPES, Setting
 
+REDUCTIONS = {"least": "min", "mean": "mean"}  # `Landscape.reduce` for each choice of `Setting.field_energy`
 HALF = 1.2  # half of the edge of the square, in the paper's unit
 # Degrees about z by which a mug is rotated if `Setting.turn` is no number. Its true path then stays in the plane.
 UPRIGHT_TURN = 60.0
@@ -71,7 +73,7 @@ def figure2(model: Model, base: Setting, field: str, count: int = 101) -> dict[s
     degrees = (UPRIGHT_TURN if base.turn == "any" else base.turn) if turn else 0.0
     R = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
     points = ((scene.points if which else scene.demonstration.points) @ R.T).astype(np.float32)
-    seen = encode(model, jnp.asarray(points))
+    seen = encode(model, jax.device_put(points))
     # Paths are relative to the centroids of the clouds, as in the losses, so they move with the centroid of a mug.
     paths = {
         name: np.asarray(reference.trajectory.translations + seen.origin) for name, reference in references.items()
@@ -87,7 +89,7 @@ def figure2(model: Model, base: Setting, field: str, count: int = 101) -> dict[s
     panels = {}
     for name, part in zip(SHAPES, np.split(np.arange(len(swept.values)), len(SHAPES))):
         fields = {field: getattr(swept, field)[part] for field in ("values", "waypoints", "turned")}
-        landscape = dataclasses.replace(swept, **fields, reduce=base.field_energy)
+        landscape = dataclasses.replace(swept, **fields, reduce=REDUCTIONS[base.field_energy])
         panels[name] = Swept(
             *(steps / base.unit for steps in swept.grid.coordinates),
             energies=landscape.combined,

@@ -1,7 +1,7 @@
-"""How sure a pick is.
+"""The uncertainty of a pick.
 
 Modules:
-    calibration: confidence and recognition: logistic curves, their fit and reliability
+    calibration: confidence and recognition as logistic curves, their fit and their reliability
     covariance: curvature, covariance and free directions of a pose
-    modes: distinct solutions among the starts
+    modes: distinct poses among the candidates
 """

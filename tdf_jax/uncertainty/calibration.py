@@ -1,4 +1,4 @@
-"""How likely a pick is right, from how much of the demonstration's descriptors it leaves unmatched."""
+"""Confidence of a pick and recognition of its object: logistic curves, their fit and their reliability."""
 
 from collections.abc import Sequence
 
@@ -7,50 +7,63 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.networks.field import DescriptorField
 
-# Logistic in log(residual), fitted on 288 picks whose truth is known, 9 of them wrong: `tdf benchmark --seed 61 --pairs
-# 72 --methods tdf_jax --clouds full views1 views2 noise`, mugs of 0.12 m. Right picks had residuals of 0.08 to 0.53
-# (all but 5 % on either side, by condition), wrong ones 0.44 to 0.83. docs/results/uncertainty.md has the reliability on others.
+# Logistic curve in log(residual), fitted on 288 picks with ground truth, 9 of them wrong: `tdf benchmark --seed 61
+# --pairs 72 --methods tdf_jax --clouds full views1 views2 noise`, mugs of 0.12 m. Right picks had residuals of 0.08 to
+# 0.53 (the 5 % and 95 % quantiles, by condition), wrong picks 0.44 to 0.83. docs/results/uncertainty.md has the
+# reliability on other mugs.
 INTERCEPT, SLOPE = -3.39, 6.55
-FITTED_ON = 61  # seed
-CALIBRATED = ("mug",)  # shipped weights that it was fitted for
-MOST = 0.99  # none of the 250 surest was wrong, and no more than that can be known from so many
+FITTED_ON = 61  # seed of the picks
+CALIBRATED = ("mug",)  # shipped weights for which the curve is fitted
+MAX_CONFIDENCE = 0.99  # none of the 250 surest picks was wrong, which supports no higher probability
+EDGES = 0.0, 0.25, 0.5, 0.75, 0.9, 0.98, 1.0  # of the bins; they are narrow near 1 because most picks are sure
+MAX_POINTS = 1500  # of a cloud; the fixed number lets clouds of all sizes run one program
+MAX_LOGIT = 3.0  # larger occupancy logits are clipped, so that a few stray points do not dominate the mean
+
+# Logistic curves in (-log residual, surface logit) by the name of shipped weights: the intercept and two slopes, fitted
+# on right and wrong cases of seed 61 by `python -m tdf_jax.evaluation.recognition_study --fit`: 40 of each for mugs, 32
+# for bowls and for bottles, 48 for all three. docs/results/uncertainty.md has the results on other cases.
+CURVES = {
+    "mug": (-2.77, 6.25, 4.76),
+    "bowl": (-28.5, 16.9, -2.35),
+    "bottle": (-20.1, 16.7, 1.18),
+    "multi": (-5.40, 5.28, -0.01),
+}
 
 
 def confidence(residual: float, intercept: float = INTERCEPT, slope: float = SLOPE) -> float | None:
-    """Probability that a pick with a residual is within 2 cm and 20 degrees of the truth.
+    """Probability that a pick is within 2 cm and 20 degrees of the ground truth.
 
-    By default it is calibrated for the shipped mug weights, demonstrations at the handle with query points in a box of
-    6 cm, and mugs of 0.12 m, complete, noisy or seen by one camera or more. Elsewhere it still falls as the match gets
-    worse, but is no probability; `tdf_jax.uncertainty.calibration.fit` fits the two numbers anew.
+    The default curve is calibrated for the shipped mug weights, demonstrations at the handle with query points in a box
+    of 6 cm, and mugs of 0.12 m, complete, noisy or seen by one camera or more. In other cases the value still falls as
+    the match gets worse, but it is not a probability; `tdf_jax.uncertainty.calibration.fit` fits another curve.
 
     Args:
-        residual: of the pick, such as `result.residual`.
-        intercept, slope: of the logistic curve in -log(residual).
+        residual: residual of the pick, such as `result.residual`, without a unit.
+        intercept: intercept of the logistic curve in -log(residual).
+        slope: slope of the logistic curve in -log(residual).
 
     Returns:
-        A number in [0, 0.99]; None for a residual that is not finite.
+        The probability, in [0, 0.99]; None if the residual is not finite.
     """
     if not np.isfinite(residual):
         return None
-    return min(MOST, float(1 / (1 + np.exp(slope * np.log(max(residual, 1e-9)) - intercept))))
-
-
-EDGES = 0.0, 0.25, 0.5, 0.75, 0.9, 0.98, 1.0  # of bins: most picks are sure
+    return min(MAX_CONFIDENCE, float(1 / (1 + np.exp(slope * np.log(max(residual, 1e-9)) - intercept))))
 
 
 def bins(predicted: Float[np.ndarray, " picks"], right: Float[np.ndarray, " picks"]) -> list[dict]:
-    """Picks in bins of `EDGES`, by rising confidence.
+    """Reliability of confidences: how many picks are right in each bin of `EDGES`.
 
     Args:
-        predicted: confidences.
-        right: 1 where the pick was, else 0.
+        predicted: confidences of the picks, (picks,).
+        right: 1 for each right pick and 0 for each wrong one, (picks,).
 
     Returns:
-        For each bin that is not empty the number of picks, the mean confidence, the share that was right and its 95 %
-        interval (Wilson).
+        For each bin that is not empty, by rising confidence: the number of picks, the mean confidence, the share of
+        right picks and its 95 % interval (Wilson).
     """
     number = np.searchsorted(EDGES[1:-1], predicted, side="right")
     rows = []
@@ -59,8 +72,8 @@ def bins(predicted: Float[np.ndarray, " picks"], right: Float[np.ndarray, " pick
         if n == 0:
             continue
         rate = float(right[chosen].mean())
-        middle, half = rate + z**2 / (2 * n), z * np.sqrt(rate * (1 - rate) / n + z**2 / (4 * n**2))
-        low, high = ((middle + sign * half) / (1 + z**2 / n) for sign in (-1, 1))
+        centre, half = rate + z**2 / (2 * n), z * np.sqrt(rate * (1 - rate) / n + z**2 / (4 * n**2))
+        low, high = ((centre + sign * half) / (1 + z**2 / n) for sign in (-1, 1))
         rows.append(
             {
                 "picks": n,
@@ -73,13 +86,28 @@ def bins(predicted: Float[np.ndarray, " picks"], right: Float[np.ndarray, " pick
 
 
 def calibration_error(rows: Sequence[dict]) -> float:
-    """Mean difference of confidence and share of right picks over bins, weighted by their numbers (expected calibration error)."""
+    """Expected calibration error: mean difference of confidence and share of right picks.
+
+    Args:
+        rows: bins from `bins`; each one is weighted by its number of picks.
+
+    Returns:
+        The error, in [0, 1].
+    """
     total = sum(row["picks"] for row in rows)
     return float(sum(row["picks"] * abs(row["predicted"] - row["right"]) for row in rows) / total)
 
 
 def ranking(predicted: Float[np.ndarray, " picks"], right: Float[np.ndarray, " picks"]) -> float | None:
-    """Share of pairs of a right and a wrong pick of which the right one has the higher confidence (area under the ROC); None without both kinds."""
+    """Area under the ROC curve: share of pairs in which a right pick has a higher confidence than a wrong one.
+
+    Args:
+        predicted: confidences of the picks, (picks,).
+        right: 1 for each right pick and 0 for each wrong one, (picks,).
+
+    Returns:
+        The area, in [0, 1]; None without both a right and a wrong pick.
+    """
     good, bad = predicted[right == 1], predicted[right == 0]
     if not len(good) or not len(bad):
         return None
@@ -89,17 +117,20 @@ def ranking(predicted: Float[np.ndarray, " picks"], right: Float[np.ndarray, " p
 def logistic(
     features: Float[np.ndarray, "cases features"], right: Float[np.ndarray, " cases"]
 ) -> Float[np.ndarray, " 1+features"]:
-    """Intercept and slopes of the logistic curve of maximal likelihood, by Newton's method.
+    """Fit a logistic curve by maximum likelihood, with Newton's method.
 
     Args:
-        features: of each case.
-        right: 1 or 0.
+        features: features of each case, (cases, features).
+        right: 1 or 0 for each case, (cases,).
+
+    Returns:
+        The intercept and the slopes, (1 + features,).
     """
     x = np.column_stack([np.ones(len(features)), features])
     weights = np.zeros(x.shape[1])
     for _ in range(100):
         p = 1 / (1 + np.exp(-x @ weights))
-        # A faint pull to zero keeps it finite where right and wrong do not overlap.
+        # A weak L2 penalty makes the solution finite if a line separates right from wrong cases.
         step = np.linalg.solve(
             x.T @ (x * (p * (1 - p))[:, None]) + 1e-3 * np.eye(len(weights)), x.T @ (right - p) - 1e-3 * weights
         )
@@ -110,83 +141,75 @@ def logistic(
 
 
 def fit(residual: Float[np.ndarray, " picks"], right: Float[np.ndarray, " picks"]) -> tuple[float, float]:
-    """Intercept and slope of `tdf_jax.confidence` of maximal likelihood.
+    """Fit the curve of `tdf_jax.confidence` by maximum likelihood.
 
     Args:
-        residual: of picks.
-        right: 1 where the pick was, else 0.
+        residual: residuals of the picks, (picks,), without a unit.
+        right: 1 for each right pick and 0 for each wrong one, (picks,).
+
+    Returns:
+        The intercept and the slope.
 
     Raises:
-        InputError: a residual that is not above 0, or picks that are all right or all wrong.
+        InputError: a residual is not above 0, or the picks are all right or all wrong.
     """
     residual, right = np.asarray(residual, float), np.asarray(right, float)
     if not (np.isfinite(residual) & (residual > 0)).all() or len(set(right)) != 2:
-        raise InputError("fit(): expected residuals above 0, some of picks that were right and some of others")
+        raise InputError(
+            f"fit(): got {residual.size} residuals and labels {sorted(set(right.ravel().tolist()))}; expected finite "
+            "residuals above 0, and labels 0 and 1, both of them"
+        )
     intercept, slope = logistic(-np.log(residual)[:, None], right)
     return float(intercept), float(slope)
 
 
-POINTS = 1500  # of the cloud that are looked at: one size, so that clouds of all sizes run one program
-CUT = 3.0  # occupancy logits beyond it count no further: a few stray points must not decide
-
-
-# Logistic in (-log residual, surface logit), by name of shipped weights: intercept and two slopes, fitted on right and
-# wrong cases of seed 61 by `python -m tdf_jax.evaluation.recognition_study --fit`: 40 of each for mugs, 32 for bowls and for bottles, 48
-# for all three. Tried on others: docs/results/uncertainty.md.
-CURVES = {
-    "mug": (-2.77, 6.25, 4.76),
-    "bowl": (-28.5, 16.9, -2.35),
-    "bottle": (-20.1, 16.7, 1.18),
-    "multi": (-5.40, 5.28, -0.01),
-}
-
-
 def surface_logit(field: DescriptorField, points: Float[Array, "points 3"]) -> float:
-    """Mean logit of the occupancy at an object's own points, each cut to [-3, 3].
+    """Mean logit of the occupancy at an object's own points, each clipped to [-3, 3].
 
-    Points of an object that the network knows lie on its surface of occupancy 1/2, logit 0; of others they come to lie
-    outside.
+    For an object of a category that the network knows, the points lie on the predicted surface of occupancy 1/2, logit
+    0. For other objects they lie outside of it.
 
     Args:
-        field: the object's.
-        points: its cloud, metres, world frame; of more than 1500, as many drawn by a fixed seed are used.
+        field: descriptor field of the object.
+        points: object point cloud, (points, 3), metres, world frame; 1500 points, drawn with a fixed seed, are used of
+            a larger one.
+
+    Returns:
+        The mean logit, in [-3, 3].
     """
-    points = np.asarray(points, np.float32)
-    if len(points) > POINTS:
-        points = points[np.random.default_rng(0).permutation(len(points))[:POINTS]]
-    return float(np.mean(_logits(field, np.resize(points, (POINTS, 3)))[: len(points)]))
+    cloud = np.asarray(points, np.float32)
+    if len(cloud) > MAX_POINTS:
+        cloud = cloud[np.random.default_rng(0).permutation(len(cloud))[:MAX_POINTS]]
+    return float(np.mean(_logits(field, np.resize(cloud, (MAX_POINTS, 3)))[: len(cloud)]))
 
 
 @jax.jit
 def _logits(field, x):
     occupancy = field.occupancy(x)
-    return jnp.clip(jnp.log(occupancy) - jnp.log1p(-occupancy), -CUT, CUT)
+    return jnp.clip(jnp.log(occupancy) - jnp.log1p(-occupancy), -MAX_LOGIT, MAX_LOGIT)
 
 
 def recognition(
     residual: float, surface_logit: float, curve: tuple[float, float, float] = CURVES["mug"]
 ) -> float | None:
-    """Probability that an object is of the category of a demonstration, if both were equally likely before.
+    """Probability that an object is of the demonstration's category, with a prior probability of one half.
 
-    By default it is fitted for the shipped mug weights: mugs against bowls and bottles, demonstrated at the handle with
-    query points in a box of 6 cm, complete, noisy or seen by one camera or more.
+    The default curve is fitted for the shipped mug weights: mugs against bowls and bottles, demonstrated at the handle
+    with query points in a box of 6 cm, complete, noisy or seen by one camera or more.
 
     Args:
-        residual: what the pick leaves unmatched, see `tdf_jax.confidence`.
-        surface_logit: see there.
-        curve: intercept of the logistic curve, and its slopes in -log(residual) and in the surface logit.
+        residual: residual of the pick, such as `result.residual`, without a unit.
+        surface_logit: mean occupancy logit at the object's points, from `tdf_jax.surface_logit`.
+        curve: intercept of the logistic curve, and its slopes in -log(residual) and in the surface logit, (3,).
 
     Returns:
-        A number in [0, 1]; None for evidence that is not finite.
+        The probability, in [0, 1]; None if the residual or the logit is not finite.
 
     Raises:
         InputError: the curve is not three finite numbers.
     """
-    if np.shape(curve) != (3,) or not np.isfinite(curve).all():
-        raise InputError(
-            f"recognition(): curve is {curve!r}; expected three finite numbers, such as those of tdf_jax.uncertainty.calibration.CURVES"
-        )
+    coefficients = checks.vector("recognition()", "curve", curve, unit="")
     if not np.isfinite([residual, surface_logit]).all():
         return None
-    exponent = np.dot(curve, (1.0, -np.log(max(residual, 1e-9)), surface_logit))
+    exponent = np.dot(coefficients, (1.0, -np.log(max(residual, 1e-9)), surface_logit))
     return float(1 / (1 + np.exp(-np.clip(exponent, -50, 50))))

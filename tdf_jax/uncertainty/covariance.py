@@ -1,4 +1,9 @@
-"""How sharply the energy determines a pose: curvature, covariance and free directions."""
+"""How sharply the energy determines a pose: curvature, covariance and free directions.
+
+Small motions of a pose are twists of six numbers (rotation, translation) along the world's axes: a rotation vector
+(radians) about the centroid of the query points, and a translation of that centroid (metres). A twist acts as a screw
+motion: (w, w x (c - a)), with the centroid c, is a rotation about the axis w through the point a, at any angle.
+"""
 
 import dataclasses
 import functools
@@ -8,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from tdf_jax._internal import checks
 from tdf_jax._internal.deprecation import renamed_fields
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import waypoint_loss
@@ -15,30 +21,31 @@ from tdf_jax.energy.reference import Reference
 from tdf_jax.geometry import se3
 from tdf_jax.networks.field import DescriptorField
 
-# The rise of the energy that counts as one sigma. Of 18 handles found on generated mugs the squared normalised errors
-# were 6.6 on average and 4.7 in the median; 6 and 5.3 are those of six normal numbers. Nearly all of it is of moves:
-# 6.3 of 3, and 0.16 of 3 of turns.
+# The rise of the energy that counts as one sigma. For 18 handles on generated mugs, the squared normalised errors had a
+# mean of 6.6 and a median of 4.7; six normal numbers have 6 and 5.3. Translations contribute 6.3 of an expected 3,
+# rotations 0.16 of an expected 3.
 SCALE = 1e-4
 
-
-# Below this share of the stiffest direction's curvature a direction is free. The turn about a cup's axis had at most
-# 0.001 where the cloud had the symmetry exactly, and 0.008 to 0.016 at handle and rim, 0.02 to 0.03 at the base, where
-# it was sampled at random; on mugs the softest direction had 0.05 at the handle, 0.08 at the rim, 0.15 at the base, or
-# more.
+# A direction is free if its curvature is below this share of the stiffest direction's. The rotation about a cup's axis
+# had at most 0.001 if the cloud had the exact symmetry. With random samples it had 0.008 to 0.016 at handle and rim,
+# and 0.02 to 0.03 at the base. The softest direction of mugs had 0.05 at the handle, 0.08 at the rim, 0.15 at the base,
+# or more.
 FREE = 0.03
 
+# Limit on the passes of the fit, and the relative change of every sigma below which it has converged. The field of a
+# mug takes three or four passes. A random network, whose sigmas differ by a factor of 100, takes the most.
+MAX_PASSES, CONVERGED = 8, 0.01
+# Radians. Times the rotation_scale, they are the lengths of the first steps and the largest length of a step.
+FIRST_ANGLE, MAX_ANGLE = np.radians(5), np.radians(15)
+MAX_SIGMA = 1.0  # radians; times the rotation_scale, the sigma of a direction without curvature
+# A unit twist is a pure translation if its rotation times the rotation_scale is smaller: its axis is then a thousand
+# rotation scales away.
+PURE_TRANSLATION = 1e-3
 
-# Passes of the fit, and the share by which a pass may still change one sigma. The field of a mug takes three or four; a
-# random network, on which the stiffest direction is 100 times as stiff as the softest in sigma, takes the most.
-PASSES, SETTLED = 8, 0.01
-FIRST_TURN, LARGEST_TURN = np.radians(5), np.radians(15)  # of the steps, which are lengths: turns times the rotation_scale
-LARGEST_SIGMA = 1.0  # radians, times the rotation_scale: what a direction without any curvature gets
-SLIDE = 1e-3  # a unit twist with less turn times rotation_scale has its axis a thousand rotation scales away
 _FIRST, _SECOND = np.tril_indices(6, -1)
 _AXES = np.eye(6)
-
-
-# Plus and minus of each: six axes, then the sums and the differences of their 15 pairs, all of length 1.
+# Directions of the steps, of length 1, each of which is taken both ways: the six axes, then the sums and the
+# differences of their 15 pairs.
 _STEPS = np.concatenate(
     [_AXES, (_AXES[_FIRST] + _AXES[_SECOND]) / np.sqrt(2), (_AXES[_FIRST] - _AXES[_SECOND]) / np.sqrt(2)]
 )
@@ -46,13 +53,14 @@ _STEPS = np.concatenate(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Screw:
-    """A twist as a motion about an axis.
+    """A twist as a screw motion about an axis.
 
     Attributes:
-        direction: of the axis, unit vector, world frame; its sign means nothing.
-        point: on the axis, the one nearest the query points' mean, metres, world frame.
-        pitch: metres along the axis for one radian about it: 0 of a pure turn, infinite of a pure move, whose `point`
-            is the mean itself.
+        direction: direction of the axis, a unit vector whose sign has no meaning, (3,), world frame.
+        point: point of the axis nearest to the centroid of the query points, (3,), metres, world frame; the centroid
+            itself if the twist is a pure translation.
+        pitch: translation along the axis for each radian about it, metres per radian; 0 for a pure rotation, infinite
+            for a pure translation.
     """
 
     direction: Float[np.ndarray, "3"]
@@ -68,20 +76,23 @@ class Screw:
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class PoseCovariance:
-    """How sharply the energy determines one pose. Twists are (turn about `centre`, move), radians and metres, world axes.
+    """How sharply the energy determines one pose.
+
+    Twists are (rotation about `centre`, translation), radians and metres, along the world's axes.
 
     Attributes:
-        curvature: H of E(twist) = E(0) + twist' H twist / 2; energy over radians and metres.
-        covariance: 2 `scale` H^-1: one sigma along any axis of the ellipsoid raises the energy by `scale`. It is
-            nowhere more than 1 radian times the rotation_scale, which is also what directions get along which the energy does
-            not rise at all.
-        values: curvatures along `directions`, rising, energy / m^2: per metre of move, or of turn times the rotation_scale.
-        directions: twists in rows, of length 1 m if turns are multiplied by the rotation_scale, and at right angles to each
-            other in that measure.
-        centre: the query points' mean at the pose, metres, world frame.
-        rotation_scale: root mean square distance of the query points from their mean, metres: what a turn of one radian moves
-            them by, in round numbers.
-        scale: rise of the energy that counts as one sigma.
+        curvature: H of E(twist) = E(0) + twist' H twist / 2, (6, 6), energy over radians and metres.
+        covariance: 2 `scale` H^-1, (6, 6), radians and metres: one sigma along any axis of the ellipsoid raises the
+            energy by `scale`. No sigma is larger than 1 radian times `rotation_scale`, which is also the sigma of
+            directions along which the energy does not rise.
+        values: curvatures along `directions`, rising, (6,), energy per square metre; rotations count as metres by
+            `rotation_scale`.
+        directions: twists in rows, (6, 6). They are orthogonal and have length 1 m if rotations are multiplied by
+            `rotation_scale`.
+        centre: centroid of the query points at the pose, (3,), metres, world frame.
+        rotation_scale: root mean square distance of the query points from their centroid, metres per radian; about the
+            distance by which a rotation of one radian moves them.
+        scale: rise of the energy that counts as one sigma, an energy.
     """
 
     curvature: Float[Array, "6 6"]
@@ -94,21 +105,30 @@ class PoseCovariance:
 
     @property
     def free(self) -> Float[np.ndarray, "free 6"]:
-        """Twists that the energy does not determine, flattest first: curvature under 3 % of the stiffest direction's, none to speak of, or a negative one.
+        """Twists that the energy does not determine, by rising curvature, (free, 6).
 
-        Where several are free, any mixture of them is as free.
+        The curvature of a free direction is below 3 % of the stiffest direction's, too small for a finite sigma, or
+        negative. If several directions are free, so are all linear combinations of them.
+
+        Raises:
+            InputError: there is a batch of poses.
         """
         values = np.asarray(self.values)
         if values.ndim != 1:
             raise InputError(
-                f"PoseCovariance.free: there is a batch of shape {values.shape[:-1]}; expected one pose. Take one by jax.tree.map(lambda part: part[i], ...)"
+                f"PoseCovariance.free: got a batch of shape {values.shape[:-1]}; expected one pose. Take one by "
+                "jax.tree.map(lambda part: part[i], ...)"
             )
-        bound = max(FREE * values[-1], float(_least_value(self.scale, self.rotation_scale)))
+        bound = max(FREE * values[-1], float(_min_curvature(self.scale, self.rotation_scale)))
         return np.asarray(self.directions)[values <= bound]
 
     @property
     def screws(self) -> list[Screw]:
-        """The free twists as motions about axes: an object of revolution's is a turn about its axis, pitch 0."""
+        """The free twists as screw motions; an object of revolution has a rotation about its axis, with pitch 0.
+
+        Raises:
+            InputError: there is a batch of poses.
+        """
         return [
             _screw(twist.astype(np.float64), np.asarray(self.centre, np.float64), float(self.rotation_scale))
             for twist in self.free
@@ -123,33 +143,31 @@ def pose_covariance(
     *,
     scale: Float[Array, ""] | float = SCALE,
 ) -> PoseCovariance:
-    """Curvature of a waypoint's descriptor energy at a pose that was found, and the covariance that follows.
+    """Estimate the curvature of a waypoint's descriptor energy at a pose, and the covariance that follows from it.
 
-    The energy is a mean of absolute values: with kinks, and near a perfect match a cone. Its second derivatives say
-    little, so the curvature is a secant: it is fitted to rises of the energy, each the mean of a step and its opposite,
-    which the slope left at the pose cancels out of. The steps are along six axes and their pairs' diagonals, the axes
-    those of the ellipsoid that the pass before found, as long as raises the energy by `scale`, or 15 degrees times the
-    rotation_scale if that is less.
+    The energy is a mean of absolute values: it has kinks, and near a perfect match it is a cone. Second derivatives say
+    little about it, so the curvature is a secant, fitted to rises of the energy. Each rise is the mean over a step and
+    its opposite, which cancels the slope at the pose. The steps follow six axes and the diagonals of their pairs. The
+    axes are those of the ellipsoid of the previous pass. The steps are as long as it takes to raise the energy by
+    `scale`, but at most 15 degrees times the rotation_scale.
 
-    It says which directions are certain and which are not on one object; how much the shapes of two objects differ it
-    cannot know. On 18 handles of generated mugs the root of the summed variances was 5.5 degrees and 3.4 mm in the
-    median, the errors 1.2 degrees and 4.6 mm: turns were better, and moves along the handle, up to 12 mm, worse than it
-    says.
+    The covariance says which directions are certain on one object. It does not include the difference of shape between
+    two objects (docs/results/code_notes.md#uncertaintycovariance).
 
     Args:
-        field: the new object's.
-        reference: the demonstration's.
-        pose: T_world_query, `wxyz_xyz`, metres; a minimum of the energy, or nearly.
-        waypoint: of the reference, which the pose is to match.
-        scale: rise of the energy that counts as one sigma; traced.
+        field: descriptor field of the new object.
+        reference: the demonstration.
+        pose: pose T_world_query at or near a minimum of the energy, `wxyz_xyz`, (7,), metres.
+        waypoint: index of the waypoint of the reference that the pose has to match; negative ones count from the end.
+        scale: rise of the energy that counts as one sigma, an energy; it may be traced.
 
     Returns:
-        The covariance. Like the pose it is of the world frame, and it turns with object and pose. Works under
-        `jax.vmap` and `jax.jit`.
+        The covariance, in the world frame. If object and pose move together, it rotates with them. The function works
+        under `jax.vmap` and `jax.jit`.
 
     Raises:
-        InputError: a pose that is not seven finite numbers with a rotation, a waypoint that is none, a scale that is
-            not above zero, or query points all at one place.
+        InputError: the pose is not seven finite numbers with a rotation, the waypoint does not exist, the scale is not
+            above zero, or all query points coincide.
     """
     pose = jnp.asarray(pose, reference.query.dtype)
     _check("pose_covariance()", reference, pose, waypoint, scale)
@@ -159,68 +177,66 @@ def pose_covariance(
 def _check(function, reference, pose, waypoint, scale):
     if pose.shape != (7,):
         raise InputError(f"{function}: pose has shape {pose.shape}; expected (7,), wxyz_xyz. For several use jax.vmap")
+    checks.pose(function, "pose", pose)
     count = len(reference.descriptors)
-    if not isinstance(waypoint, int | np.integer) or isinstance(waypoint, bool) or not -count <= waypoint < count:
+    checks.count(function, "waypoint", waypoint, least=-count, most=count - 1)
+    checks.positive(function, "scale", scale, unit="an energy")
+    if not checks.traced(reference.query) and not np.ptp(reference.query, axis=0).any():
         raise InputError(
-            f"{function}: waypoint is {waypoint!r}; expected a whole number below the reference's {count} waypoints"
-        )
-    if not isinstance(pose, jax.core.Tracer) and not (np.isfinite(pose).all() and np.linalg.norm(pose[:4]) > 1e-6):
-        raise InputError(
-            f"{function}: pose is {np.asarray(pose).tolist()}; expected finite numbers, w x y z of a rotation first"
-        )
-    if not isinstance(scale, jax.core.Tracer) and not (np.ndim(scale) == 0 and 0 < scale < np.inf):
-        raise InputError(f"{function}: scale is {scale}; expected an energy above 0, such as {SCALE}")
-    if not isinstance(reference.query, jax.core.Tracer) and not np.ptp(reference.query, axis=0).any():
-        raise InputError(
-            f"{function}: all query points are at one place, where turns change nothing; expected several, such as tdf.box_query(key, count=500)"
+            f"{function}: all query points coincide, so that no rotation can be determined; expected distinct points, "
+            "such as tdf.box_query(key, count=500)"
         )
 
 
 @jax.jit
 def _covariance(field, query, descriptors, pose, scale):
-    R, middle = se3.rotation(pose), jnp.mean(query, axis=0)
-    query = query - middle
+    R, centroid = se3.rotation(pose), jnp.mean(query, axis=0)
+    query = query - centroid
     rotation_scale = jnp.sqrt(jnp.mean(jnp.sum(query**2, axis=-1)))
-    centre = se3.rotate(R, middle[None])[0] + se3.translation(pose)
+    centre = se3.rotate(R, centroid[None])[0] + se3.translation(pose)
 
     def energy(step):
-        # In the query's axes the steps turn with object and pose, and so does all that follows from them.
-        turned, moved = _screwed(R, step[:3] / rotation_scale, step[3:])
-        return waypoint_loss(turned, centre + moved, field, query, descriptors)
+        # Steps are along the axes of the query frame, so they rotate with object and pose, as do the results.
+        R_stepped, shift = _screw_motion(R, step[:3] / rotation_scale, step[3:])
+        return waypoint_loss(R_stepped, centre + shift, field, query, descriptors)
 
     start = energy(jnp.zeros(6, query.dtype))
     steps = jnp.asarray(_STEPS, query.dtype)
 
-    def stretched(values):
+    def step_lengths(values):
         """Lengths of steps that raise the energy by the scale, if the curvatures are right."""
-        return jnp.sqrt(2 * scale / jnp.maximum(values, 2 * scale / (LARGEST_TURN * rotation_scale) ** 2))
+        return jnp.sqrt(2 * scale / jnp.maximum(values, 2 * scale / (MAX_ANGLE * rotation_scale) ** 2))
 
-    def again(found):
-        count, lengths, _, values = found
-        return (count == 0) | (count < PASSES) & jnp.any(jnp.abs(stretched(values) / lengths - 1) > SETTLED)
+    def unconverged(state):
+        count, lengths, _, values = state
+        return (count == 0) | (count < MAX_PASSES) & jnp.any(jnp.abs(step_lengths(values) / lengths - 1) > CONVERGED)
 
-    def once(found):
-        count, lengths, axes, values = found  # the axes in columns, of length 1
-        lengths = jnp.where(count == 0, lengths, stretched(values))
+    def one_pass(state):
+        count, lengths, axes, values = state  # the axes are unit vectors in columns
+        lengths = jnp.where(count == 0, lengths, step_lengths(values))
         along = _product(steps, (axes * lengths).T)
         energies = jax.lax.map(energy, jnp.concatenate([along, -along])).reshape(2, -1)
         rises = jnp.mean(energies, axis=0) - start
         sums, differences = jnp.split(rises[6:], 2)
-        # A least squares fit to all rises would mix those of the diagonals into the curvatures: a cone rises along a
-        # free axis plus another by 1 / sqrt(2) instead of 1 / 2, and free axes came out at 0.004 to 0.01 of the
-        # stiffest instead of under 0.001.
+        # A least squares fit to all rises would mix those of the diagonals into the curvatures. Along the diagonal of a
+        # free axis and another one, a cone rises by 1 / sqrt(2) instead of 1 / 2, so free axes got curvatures of 0.004
+        # to 0.01 of the stiffest instead of less than 0.001.
         mixed = jnp.zeros((6, 6), rises.dtype).at[_FIRST, _SECOND].set(sums - differences)
         matrix = (jnp.diag(2 * rises[:6]) + mixed + mixed.T) / (lengths[:, None] * lengths)
-        values, rotated = jnp.linalg.eigh(matrix)
-        return count + 1, lengths, _product(axes, rotated), values
+        values, vectors = jnp.linalg.eigh(matrix)
+        return count + 1, lengths, _product(axes, vectors), values
 
-    first = jnp.full(6, FIRST_TURN * rotation_scale, query.dtype), jnp.eye(6, dtype=query.dtype), jnp.zeros(6, query.dtype)
-    _, _, axes, values = jax.lax.while_loop(again, once, (jnp.int32(0), *first))
-    axes = jnp.concatenate([_product(R, axes[:3]), _product(R, axes[3:])])  # the world's axes
-    # Twists of unit length in columns, and what measures a twist along them.
+    first = (
+        jnp.full(6, FIRST_ANGLE * rotation_scale, query.dtype),
+        jnp.eye(6, dtype=query.dtype),
+        jnp.zeros(6, query.dtype),
+    )
+    _, _, axes, values = jax.lax.while_loop(unconverged, one_pass, (jnp.int32(0), *first))
+    axes = jnp.concatenate([_product(R, axes[:3]), _product(R, axes[3:])])  # along the world's axes
+    # Both are in columns: twists of unit length, and the covectors that give the components of a twist along them.
     directions = jnp.concatenate([axes[:3] / rotation_scale, axes[3:]])
     measures = jnp.concatenate([axes[:3] * rotation_scale, axes[3:]])
-    sigma_squared = 2 * scale / jnp.maximum(values, _least_value(scale, rotation_scale))
+    sigma_squared = 2 * scale / jnp.maximum(values, _min_curvature(scale, rotation_scale))
     return PoseCovariance(
         curvature=_product(measures * values, measures.T),
         covariance=_product(directions * sigma_squared, directions.T),
@@ -232,29 +248,31 @@ def _covariance(field, query, descriptors, pose, scale):
     )
 
 
-def _least_value(scale, rotation_scale):
-    """The curvature at which one sigma is as large as it may be."""
-    return 2 * scale / (LARGEST_SIGMA * rotation_scale) ** 2
+def _min_curvature(scale, rotation_scale):
+    """The curvature at which sigma has its largest value."""
+    return 2 * scale / (MAX_SIGMA * rotation_scale) ** 2
 
 
-def _screwed(R, turn, move):
-    """A rotation after a twist, and where the twist carries the point that it turns about, relative to that point."""
-    angle = jnp.linalg.norm(turn)
+def _screw_motion(R, rotation, translation):
+    """Apply a twist along the axes of the query frame to R; return the new R and the centroid's shift, world frame."""
+    angle = jnp.linalg.norm(rotation)
     safe = jnp.maximum(angle, 1e-12)
-    axis = turn / safe
+    axis = rotation / safe
     sinc, versine = jnp.sinc(angle / jnp.pi), (1 - jnp.cos(angle)) / safe
-    carried = sinc * move + (1 - sinc) * jnp.sum(axis * move) * axis + versine * jnp.cross(axis, move)
-    return _product(R, se3.exp(turn)), se3.rotate(R, carried[None])[0]
+    along = jnp.sum(axis * translation)
+    shift = sinc * translation + (1 - sinc) * along * axis + versine * jnp.cross(axis, translation)
+    return _product(R, se3.exp(rotation)), se3.rotate(R, shift[None])[0]
 
 
 def _product(a, b):
-    # The default precision rounds float32 to 10 bits on some accelerators.
+    # On some accelerators the default precision rounds float32 to 10 bits.
     return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
 
 
 def _screw(twist, centre, rotation_scale):
-    turn, move = twist[:3], twist[3:]
-    squared = turn @ turn
-    if rotation_scale**2 * squared < SLIDE**2:
-        return Screw(move / np.linalg.norm(move), centre, np.inf)
-    return Screw(turn / np.sqrt(squared), centre + np.cross(turn, move) / squared, float(turn @ move / squared))
+    rotation, translation = twist[:3], twist[3:]
+    squared = rotation @ rotation
+    if rotation_scale**2 * squared < PURE_TRANSLATION**2:
+        return Screw(translation / np.linalg.norm(translation), centre, np.inf)
+    point = centre + np.cross(rotation, translation) / squared
+    return Screw(rotation / np.sqrt(squared), point, float(rotation @ translation / squared))

@@ -1,32 +1,28 @@
-"""Alternatives and certainty: which distinct poses the starts came to, and how sharply the energy determines one of them.
-
-Small motions of a pose are twists: a turn (a rotation vector, radians) about the mean of the query points, and a move
-of it (metres), both along the world's axes, six numbers (turn, move). They act as screws: a twist (w, w x (c - a)),
-with c the mean, is exactly a turn about the axis w through a, at any angle.
-"""
+"""Modes of a pick: the distinct poses to which several candidates converged."""
 
 import dataclasses
 
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 
-# Radians and metres within which starts count as one mode. At their minima, starts that came to one pose were within
-# 0.4 degrees and 0.1 mm of each other on generated mugs; starts that are still on their way, such as finalists after 4
-# polishing steps, lie 5 to 90 degrees from it, and no bound tells them from modes.
+# Radians and metres within which candidates count as one mode. On generated mugs, converged candidates of one pose were
+# within 0.4 degrees and 0.1 mm of each other. Candidates that have not converged, such as those of `solve` after 4
+# polishing steps, are 5 to 90 degrees from it, and no bound separates them from modes.
 SAME_ANGLE, SAME_DISTANCE = np.radians(15), 0.02
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Mode:
-    """Starts that came to the same pose.
+    """Candidates that converged to the same pose.
 
     Attributes:
-        pose: of the start with the least energy, `wxyz_xyz`.
-        energy: of that start.
-        members: which starts, by rising energy; the first is the one of `pose`.
-        share: of the finite starts that are members.
+        pose: pose T_world_query of the member with the lowest energy, `wxyz_xyz`, (7,), metres.
+        energy: energy of that member.
+        members: indices of the candidates in this mode, by rising energy, (members,); the first one has `pose`.
+        share: number of members divided by the number of finite candidates.
     """
 
     pose: Float[np.ndarray, "7"]
@@ -42,59 +38,59 @@ def cluster_poses(
     angle: float = SAME_ANGLE,
     distance: float = SAME_DISTANCE,
 ) -> list[Mode]:
-    """The distinct poses among those that several starts came to.
+    """Group the poses of several candidates into distinct modes.
 
-    From the least energy upwards, a start joins the first mode whose `pose` is near it in both turn and distance, or
-    else begins one. Starts of equal energy are taken in their order.
+    Candidates are visited by rising energy. A candidate joins the first mode whose `pose` is within both bounds, or
+    else begins a mode of its own. Candidates of equal energy are visited in the order of the rows.
 
-    The starts have to be at their minima, or they are counted where they happen to be: of six finalists on generated
-    mugs `solve` with its 4 polishing steps left 1 to 6 modes, and with 60 one, in 4 of 18 cases two, the other about
-    half a turn away. Where the energy leaves a direction free (`pose_covariance`), starts anywhere along it are modes
-    of their own, of equal energies.
+    The candidates have to be converged; otherwise one minimum counts as several modes
+    (docs/results/code_notes.md#uncertaintymodes). If the energy does not determine a direction (`pose_covariance`),
+    candidates along that direction are modes of their own, with equal energies.
 
     Args:
-        wxyz_xyz: one pose of each start, such as the picks `result.trajectories[:, 0]`, T_world_query, metres.
-        energies: of the starts, such as `result.energies`.
-        angle: largest turn between a member and its mode's pose, radians.
-        distance: largest distance between their translations, metres.
+        wxyz_xyz: poses T_world_query, such as the picks `result.trajectories[:, 0]`, (candidates, 7), metres.
+        energies: energies of the candidates, such as `result.energies`, (candidates,).
+        angle: largest rotation between a member and the pose of its mode, radians.
+        distance: largest distance between a member and the pose of its mode, metres.
 
     Returns:
-        The modes by rising energy. Starts whose pose or energy is not finite belong to none; without a finite one the
-        list is empty.
+        The modes by rising energy. Candidates whose pose or energy is not finite belong to no mode; the list is empty
+        if no candidate is finite.
 
     Raises:
-        InputError: poses and energies that do not fit together, a quaternion of length zero, or a negative bound.
+        InputError: poses and energies do not have matching shapes, a quaternion has length zero, or a bound is negative
+            or not finite.
 
     Source:
-        Leader clustering (Hartigan, "Clustering Algorithms", 1975, ch. 3), with the energies as its order.
+        Leader clustering (Hartigan, "Clustering Algorithms", 1975, ch. 3), in the order of the energies.
     """
-    wxyz_xyz, energies = np.asarray(wxyz_xyz), np.asarray(energies)
-    if wxyz_xyz.ndim != 2 or wxyz_xyz.shape[1] != 7 or energies.shape != wxyz_xyz.shape[:1]:
+    poses, values = np.asarray(wxyz_xyz), np.asarray(energies)
+    if poses.ndim != 2 or poses.shape[1] != 7 or values.shape != poses.shape[:1]:
         raise InputError(
-            f"cluster_poses(): poses have shape {wxyz_xyz.shape} and energies {energies.shape}; expected (candidates, 7) and (candidates,). "
-            "Take one waypoint of each start, such as result.trajectories[:, 0]"
+            f"cluster_poses(): poses have shape {poses.shape} and energies {values.shape}; expected (candidates, 7) "
+            "and (candidates,). Take one waypoint of each candidate, such as result.trajectories[:, 0]"
         )
-    for name, bound in (("angle", angle), ("distance", distance)):
-        if not 0 <= bound < np.inf:
-            raise InputError(f"cluster_poses(): {name} is {bound}; expected a finite number of 0 or more")
-    finite = np.flatnonzero(np.isfinite(energies) & np.isfinite(wxyz_xyz).all(axis=1))
-    wxyz, xyz = wxyz_xyz[:, :4].astype(np.float64), wxyz_xyz[:, 4:].astype(np.float64)
+    checks.number("cluster_poses()", "angle", angle, least=0, unit="radians")
+    checks.number("cluster_poses()", "distance", distance, least=0, unit="metres")
+    finite = np.flatnonzero(np.isfinite(values) & np.isfinite(poses).all(axis=1))
+    wxyz, xyz = poses[:, :4].astype(np.float64), poses[:, 4:].astype(np.float64)
     lengths = np.linalg.norm(wxyz[finite], axis=1)
     if not (lengths > 1e-6).all():
         raise InputError(
-            f"cluster_poses(): the quaternion of start {finite[np.argmin(lengths)]} has length {lengths.min():.1e}; expected w x y z of a rotation, length 1"
+            f"cluster_poses(): the quaternion of candidate {finite[np.argmin(lengths)]} has length "
+            f"{lengths.min():.1e}; expected a unit quaternion wxyz"
         )
     wxyz[finite] /= lengths[:, None]
 
-    left, modes = finite[np.argsort(energies[finite], kind="stable")], []
-    while len(left):
-        best = left[0]
-        # q and -q are one rotation; the chord between unit quaternions is 2 sin(angle / 4), which is exact for small
-        # angles as an arc cosine is not.
-        chords = np.minimum(*(np.linalg.norm(wxyz[left] + sign * wxyz[best], axis=1) for sign in (-1, 1)))
+    remaining, modes = finite[np.argsort(values[finite], kind="stable")], []
+    while len(remaining):
+        best = remaining[0]
+        # q and -q are one rotation. The chord between unit quaternions is 2 sin(angle / 4), which is accurate for small
+        # angles; an arc cosine is not.
+        chords = np.minimum(*(np.linalg.norm(wxyz[remaining] + sign * wxyz[best], axis=1) for sign in (-1, 1)))
         near = (4 * np.arcsin(np.minimum(chords / 2, 1)) <= angle) & (
-            np.linalg.norm(xyz[left] - xyz[best], axis=1) <= distance
+            np.linalg.norm(xyz[remaining] - xyz[best], axis=1) <= distance
         )
-        members, left = left[near], left[~near]
-        modes.append(Mode(wxyz_xyz[best], float(energies[best]), members, len(members) / len(finite)))
+        members, remaining = remaining[near], remaining[~near]
+        modes.append(Mode(poses[best], float(values[best]), members, len(members) / len(finite)))
     return modes

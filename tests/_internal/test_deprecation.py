@@ -10,6 +10,7 @@ import pytest
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
+from tdf_jax.landscape.storage import Landscape, load_landscape, save_landscape
 from tdf_jax.solvers.result import Result
 from tdf_jax.training import run_folder
 from tdf_jax.training.config import TrainConfig
@@ -193,3 +194,27 @@ def test_a_shape_has_clay():
     mug = tdf.build_mug()
     with pytest.warns(DeprecationWarning, match=r"^Mug.clay is deprecated; use Mug.solid$"):
         assert mug.clay is mug.solid
+
+
+@pytest.mark.parametrize(("old", "new"), [("least", "min"), ("soft_least", "softmin")])
+def test_landscapes_take_the_former_reductions(field, reference, tmp_path, old, new):
+    parts = (tdf.plane_grid(1.0, 2), np.ones((1, 2, 2)), np.zeros((1, 3)), np.eye(3)[None], np.zeros((1, 2, 2), int))
+    with pytest.warns(
+        DeprecationWarning, match=rf"^Landscape\(reduce='{old}'\) is deprecated; use reduce='{new}'$"
+    ) as w:
+        assert Landscape(*parts, reduce=old).reduce == new
+    assert w[0].filename == __file__
+    with pytest.warns(DeprecationWarning, match=rf"^energy_landscape\(reduce='{old}'\) is deprecated; use") as w:
+        landscape = tdf.energy_landscape(field, reference, tdf.plane_grid(0.1, 2), reduce=old)
+    assert [one.filename for one in w] == [__file__]
+    assert landscape.reduce == new
+    # Files of the release before have the former choice; they are read without a warning.
+    save_landscape(tmp_path / "new.npz", landscape)
+    with np.load(tmp_path / "new.npz") as file:
+        arrays = dict(file)
+    header = str(arrays.pop("header")).replace(f'"reduce": "{new}"', f'"reduce": "{old}"')
+    assert old in header
+    np.savez(tmp_path / "old.npz", header=np.array(header), **arrays)
+    again, _ = load_landscape(tmp_path / "old.npz")
+    assert again.reduce == new
+    np.testing.assert_array_equal(again.combined, landscape.combined)

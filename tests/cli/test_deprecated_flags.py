@@ -38,3 +38,12 @@ def test_an_old_name_sets_the_option(command, capsys):
 def test_new_names_have_no_warning(capsys):
     words = ["evaluate", "--num-starts", "3"]
     assert command_line._current(words) == words and capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(("old", "new"), [("least", "min"), ("soft_least", "softmin")])
+def test_an_old_choice_stands_for_the_new_one_with_a_warning(old, new, capsys):
+    for words, current in ((["--reduce", old], ["--reduce", new]), ([f"--reduce={old}"], [f"--reduce={new}"])):
+        assert command_line._current(["landscape", *words, "--json"]) == ["landscape", *current, "--json"]
+        assert capsys.readouterr().err == f"tdf: warning: --reduce {old} is deprecated; use --reduce {new}\n"
+    for words in (["imitate", "--reduce", old], ["landscape", "--out", old]):
+        assert command_line._current(words) == words and capsys.readouterr().err == ""

@@ -53,14 +53,14 @@ def test_a_run_writes_every_file_and_nothing_beside_them(weights, tmp_path, grid
 
 
 def test_the_record_and_the_landscape_agree(sweep):
-    record, found = sweep("--grid", "volume", "--reduce", "soft_least")
+    record, found = sweep("--grid", "volume", "--reduce", "softmin")
     assert record["grid"]["shape"] == [5, 5, 5] == list(found.grid.shape)
     np.testing.assert_allclose(record["grid"]["steps"], 0.05)
     np.testing.assert_allclose(record["minimisers"], found.minimisers)
     apart = np.linalg.norm(found.minimisers - record["truth"], axis=1)
     np.testing.assert_allclose(record["minimiser_metres"], apart)
     assert record["energy"]["least"] == pytest.approx(float(found.combined.min()))
-    assert found.reduce == "soft_least"
+    assert found.reduce == "softmin"
     path = np.array(record["path"])
     ends = np.array(record["truth"])[[0, -1]]
     nearest = [

@@ -900,7 +900,7 @@ def test_the_ranking_is_the_share_of_pairs_in_order():
 @pytest.mark.parametrize(("intercept", "slope"), [(-3.0, 2.5), (0.5, 1.0), (-6.0, 5.0)])
 def test_the_fit_recovers_what_the_confidences_were_made_with(monkeypatch, intercept, slope):
     """So it is of the very formula that gives confidences."""
-    monkeypatch.setattr(calibration, "MOST", 1.0)
+    monkeypatch.setattr(calibration, "MAX_CONFIDENCE", 1.0)
     rng = np.random.default_rng(0)
     residual = np.exp(rng.normal(-1.0, 0.6, 4000))
     right = (rng.uniform(size=4000) < [calibration.confidence(one, intercept, slope) for one in residual]).astype(float)

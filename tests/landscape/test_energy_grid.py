@@ -41,12 +41,12 @@ def lattice_reference(small_model, demonstration):
 
 @pytest.fixture
 def small_tiles(monkeypatch):
-    """Several tiles and chunks even of small grids, and blocks of channels that do not come out even."""
+    """Small limits, so that small grids have several tiles and chunks, and the last block of channels is padded."""
     for name, value in {"NODES": 60, "CHUNK_POINTS": 40, "UNROLLED": 5}.items():
         monkeypatch.setattr(shared_lattice, name, value)
 
 
-@pytest.mark.parametrize("R", [None, pytest.param(RANDOM[0], marks=SLOW)], ids=["upright", "turned"])
+@pytest.mark.parametrize("R", [None, pytest.param(RANDOM[0], marks=SLOW)], ids=["upright", "rotated"])
 def test_energies_equal_those_of_single_poses(field, reference, R, small_tiles):
     grid = Grid(np.asarray(field.origin), np.eye(3)[:2], (np.linspace(-0.1, 0.1, 4), np.linspace(-0.2, 0.1, 11)))
     landscape = energy_landscape(field, reference, grid, R)
@@ -55,7 +55,7 @@ def test_energies_equal_those_of_single_poses(field, reference, R, small_tiles):
 
 
 @pytest.mark.parametrize("axes", ["plane", pytest.param("volume", marks=SLOW), pytest.param("line", marks=SLOW)])
-@pytest.mark.parametrize("R", [pytest.param(np.eye(3), marks=SLOW), RANDOM[1]], ids=["upright", "turned"])
+@pytest.mark.parametrize("R", [pytest.param(np.eye(3), marks=SLOW), RANDOM[1]], ids=["upright", "rotated"])
 def test_shared_energies_equal_those_of_single_poses(field, lattice_reference, axes, R, small_tiles):
     count = {"line": 1, "plane": 2, "volume": 3}[axes]
     coordinates = tuple(0.012 * np.arange(-2, size) for size in (4, 3, 7)[:count])
@@ -73,7 +73,7 @@ def test_sharing_changes_nothing(field, lattice_reference, small_tiles):
     np.testing.assert_allclose(shared, alone, rtol=1e-5)
 
 
-def test_the_best_of_several_rotations_is_kept_for_each_point_and_waypoint(field, reference, small_tiles):
+def test_each_point_and_waypoint_has_the_best_of_several_rotations(field, reference, small_tiles):
     grid = plane_grid(0.1, 4, np.asarray(field.origin))
     best = energy_landscape(field, reference, grid, RANDOM)
     each = energy_landscape(field, reference, grid, RANDOM, over_rotations="each")
@@ -98,7 +98,7 @@ def test_the_best_of_several_rotations_is_kept_for_each_point_and_waypoint(field
 
 
 @pytest.mark.slow
-def test_points_that_do_not_count_are_nan(field, reference, small_tiles):
+def test_points_outside_the_mask_are_nan(field, reference, small_tiles):
     grid = path_grid(np.asarray(field.origin) + np.array([[0.0, 0, 0], [0.1, 0.1, 0]]), 0.03, 0.015)
     landscape = energy_landscape(field, reference, grid)
     np.testing.assert_array_equal(np.isnan(landscape.values), np.broadcast_to(~grid.mask, landscape.values.shape))
@@ -111,7 +111,7 @@ def test_points_that_do_not_count_are_nan(field, reference, small_tiles):
 
 
 def test_the_demonstrations_own_waypoints_are_the_minimisers(small_model):
-    """On the object of the demonstration itself, each waypoint's energy is zero at its place."""
+    """On the object of the demonstration itself, each waypoint has zero energy at its own position."""
     grid = plane_grid(0.3, 7)
     places = [(2, 5), (3, 3), (6, 1)]
     path = jnp.asarray([[1, 0, 0, 0, *grid.points[place]] for place in places], jnp.float32)
@@ -129,7 +129,7 @@ def test_the_demonstrations_own_waypoints_are_the_minimisers(small_model):
 
 
 @pytest.mark.parametrize("over_rotations", ["best", "each"])
-def test_a_sweep_goes_on_where_it_stood(field, reference, over_rotations, small_tiles):
+def test_an_interrupted_sweep_continues(field, reference, over_rotations, small_tiles):
     grid = volume_grid(0.03, 5, np.asarray(field.origin))
     whole = energy_landscape(field, reference, grid, RANDOM, over_rotations=over_rotations)
     landscape = blank(field, reference, grid, RANDOM, over_rotations=over_rotations)
@@ -147,11 +147,11 @@ def test_a_sweep_goes_on_where_it_stood(field, reference, over_rotations, small_
         np.testing.assert_array_equal(landscape.turned, whole.turned)
 
 
-def test_progress_is_told(field, reference, small_tiles):
-    told = []
-    energy_landscape(field, reference, plane_grid(0.1, 12), progress=lambda *both: told.append(both))
-    assert told == [(done, len(told)) for done in range(1, len(told) + 1)]
-    assert len(told) > 1
+def test_progress_is_reported(field, reference, small_tiles):
+    calls = []
+    energy_landscape(field, reference, plane_grid(0.1, 12), progress=lambda *both: calls.append(both))
+    assert calls == [(done, len(calls)) for done in range(1, len(calls) + 1)]
+    assert len(calls) > 1
 
 
 def test_another_grid_of_one_size_compiles_nothing(field, reference):
@@ -162,7 +162,7 @@ def test_another_grid_of_one_size_compiles_nothing(field, reference):
 
 
 @pytest.mark.slow
-def test_the_change_of_a_query_set_is_told(small_model, demonstration, field, reference):
+def test_query_change_measures_the_effect_of_snapping(small_model, demonstration, field, reference):
     grid = volume_grid(0.2, 5, np.asarray(field.origin))
     assert query_change(field, reference, reference, grid) == (0.0, 0.0)
     changes = []
@@ -175,23 +175,23 @@ def test_the_change_of_a_query_set_is_told(small_model, demonstration, field, re
         energy_landscape(field, one, grid, RANDOM[0]).values for one in (reference, tdf.describe(small_model, snapped))
     ]
     true = np.abs(whole[1] / whole[0] - 1)
-    told = query_change(field, reference, tdf.describe(small_model, snapped), grid, RANDOM[0], samples=2000)
-    np.testing.assert_allclose(told, (np.median(true), true.max()), rtol=0.05)
+    sampled = query_change(field, reference, tdf.describe(small_model, snapped), grid, RANDOM[0], samples=2000)
+    np.testing.assert_allclose(sampled, (np.median(true), true.max()), rtol=0.05)
 
 
-def test_what_does_not_fit_is_refused(field, reference):
+def test_bad_arguments_are_refused(field, reference):
     grid = plane_grid(0.2, 3)
     with pytest.raises(InputError, match=r"rotation has shape \(7,\)"):
         energy_landscape(field, reference, grid, jnp.zeros(7))
     for matrix in (2 * np.eye(3), np.diag([1.0, 1.0, -1.0])):
-        with pytest.raises(InputError, match="no rotations"):
+        with pytest.raises(InputError, match="rotation is not orthonormal"):
             energy_landscape(field, reference, grid, matrix)
     with pytest.raises(InputError, match=r"energy_landscape\(\): device_mesh is .*expected a jax.sharding.Mesh"):
         energy_landscape(field, reference, grid, device_mesh=jax.devices())
     with pytest.raises(InputError, match="over_rotations is 'all'"):
         energy_landscape(field, reference, grid, over_rotations="all")
-    with pytest.raises(InputError, match="reduce is 'min'"):
-        energy_landscape(field, reference, grid, reduce="min")
+    with pytest.raises(InputError, match=r"energy_landscape\(\): reduce is 'max'"):
+        energy_landscape(field, reference, grid, reduce="max")
     other = dataclasses.replace(reference, descriptors=reference.descriptors[..., :5])
     with pytest.raises(InputError, match="same model"):
         energy_landscape(field, other, grid)

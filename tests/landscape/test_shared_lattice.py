@@ -1,4 +1,4 @@
-"""Sharing evaluations: which query points form a layer, which tiles cover a grid, how much is evaluated."""
+"""Shared evaluations: layers of query points, tiles of a grid, and the number of evaluations."""
 
 import numpy as np
 import pytest
@@ -10,26 +10,26 @@ from tdf_jax.landscape import shared_lattice
 TILTED = np.array([[np.cos(0.5), np.sin(0.5), 0.0], [-np.sin(0.5), np.cos(0.5), 0.0], [0.0, 0.0, 1.0]])
 
 
-def stands(grid, layers, index):
-    """Where every query point stands when the query frame is at a grid point: from the layers, in the query's order."""
+def positions(grid, layers, index):
+    """Positions of the query points with the query frame at a grid point, from the layers, in the query's order."""
     axes = grid.steps[:, None] * grid.directions
-    places = np.empty((len(layers.order), 3))
+    points = np.empty((len(layers.order), 3))
     for base, begin, end in zip(layers.offsets, layers.first, layers.first[1:]):
-        places[layers.order[begin:end]] = grid.first + np.asarray(index) @ axes + base + layers.shifts[begin:end] @ axes
-    return places
+        points[layers.order[begin:end]] = grid.first + np.asarray(index) @ axes + base + layers.shifts[begin:end] @ axes
+    return points
 
 
 @pytest.mark.parametrize("share", [True, False])
 @pytest.mark.parametrize(
     "grid", [plane_grid(0.06, 11), plane_grid(0.06, 11, axes=TILTED[:2]), volume_grid(0.03, 6), plane_grid(0.05, 8)]
 )
-def test_layers_put_every_query_point_where_it_stands(grid, share):
+def test_layers_give_the_position_of_every_query_point(grid, share):
     rng = np.random.default_rng(0)
     offsets = np.concatenate([tdf.lattice_query((2, 3, 2), 0.012), rng.normal(size=(5, 3)) * 0.03])
     layers = shared_lattice.layers(grid, offsets, share)
     assert sorted(layers.order) == list(range(17))
     index = (3, 1, 2)[: len(grid.shape)]
-    np.testing.assert_allclose(stands(grid, layers, index), grid.points[index] + offsets, atol=1e-7)
+    np.testing.assert_allclose(positions(grid, layers, index), grid.points[index] + offsets, atol=1e-7)
     assert layers.shifts.min() == 0
 
 
@@ -50,18 +50,18 @@ def test_a_lattice_of_half_the_pitch_forms_layers_that_interlock():
     np.testing.assert_array_equal(np.diff(layers.first), 8)
 
 
-def test_a_turned_lattice_shares_where_the_grid_turns_with_it():
+def test_a_rotated_lattice_shares_if_the_grid_is_rotated_with_it():
     query = np.asarray(tdf.lattice_query((3, 3, 2), 0.012)) @ TILTED
     assert len(shared_lattice.layers(plane_grid(0.06, 11, axes=TILTED[:2]), query).offsets) == 2
     assert len(shared_lattice.layers(plane_grid(0.06, 11), query).offsets) == 18
 
 
 def test_points_nearly_on_the_lattice_do_not_share():
-    """A hundredth of a step is 0.1 mm: not the same place."""
+    """A hundredth of a step, 0.1 mm, is more than the tolerance."""
     query = np.asarray(tdf.lattice_query((2, 2, 1), 0.012), float)
     query[0, 0] += 1e-4
     assert len(shared_lattice.layers(plane_grid(0.06, 11), query).offsets) == 2
-    query[0, 0] -= 1e-4 - 1e-8  # float32's rounding is
+    query[0, 0] -= 1e-4 - 1e-8  # the rounding of float32 is less
     assert len(shared_lattice.layers(plane_grid(0.06, 11), query).offsets) == 1
 
 
@@ -99,7 +99,7 @@ def test_tiles_cover_a_grid_once(shape, span, monkeypatch):
     assert nodes <= 3000 or size == (1,) * (len(shape) - 1) + (shared_lattice.LANES,)
 
 
-def test_tiles_without_a_point_that_counts_are_left_out(monkeypatch):
+def test_tiles_outside_the_mask_are_omitted(monkeypatch):
     monkeypatch.setattr(shared_lattice, "NODES", 500)
     grid = path_grid(np.array([[0.0, 0, 0], [0.5, 0.5, 0.5]]), 0.03, 0.01)
     tiles = shared_lattice.tiles(grid, (0, 0, 0))

@@ -21,7 +21,7 @@ def length(path):
     return np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
 
 
-def test_where_all_costs_the_same_the_path_is_the_shortest():
+def test_under_a_constant_energy_the_path_is_the_shortest():
     grid = plane_grid(1.0, 21)
     path = lowest_cost_path(of(grid, np.ones(grid.shape)), (-1, -1, 0), (1, 1, 0))
     np.testing.assert_allclose(path, np.linspace((-1, -1, 0), (1, 1, 0), 21), atol=1e-9)
@@ -56,7 +56,7 @@ def test_the_cost_is_the_integral_over_length():
 
 
 def test_a_step_costs_the_mean_of_both_ends():
-    """The dear point is the goal's neighbour on one way, the goal's and its own steps cost half of it each."""
+    """The expensive point is next to the goal on one way; each of its two steps costs half of its energy."""
     grid = Grid(np.zeros(3), np.eye(3)[:2], (np.linspace(0, 0.2, 3), np.linspace(0, 0.1, 2)))
     energy = np.array([[1.0, 1.0], [2.4, 1.0], [1.0, 9.0]])  # straight: 2 x 1.7; by (0.1, 0.1), diagonal: 2 x 1.414
     np.testing.assert_allclose(lowest_cost_path(of(grid, energy), (0, 0, 0), (0.2, 0, 0))[1], (0.1, 0.1, 0))
@@ -67,7 +67,7 @@ def test_a_step_costs_the_mean_of_both_ends():
     np.testing.assert_allclose(lowest_cost_path(of(grid, energy), (0, 0, 0), (0.2, 0, 0))[1], (0.1, 0.1, 0))
 
 
-def test_paths_go_through_volumes_with_unequal_steps_and_only_where_points_count():
+def test_paths_in_volumes_with_unequal_steps_remain_inside_the_mask():
     grid = Grid(np.zeros(3), np.eye(3), (np.linspace(0, 0.3, 4), np.linspace(0, 0.2, 3), np.linspace(0, 0.5, 6)))
     path = lowest_cost_path(of(grid, np.ones(grid.shape)), (0, 0, 0), (0.3, 0, 0.5))
     assert length(path) == pytest.approx(3 * np.sqrt(0.02) + 0.2)
@@ -79,10 +79,10 @@ def test_paths_go_through_volumes_with_unequal_steps_and_only_where_points_count
     assert all(near.mask.ravel()[np.abs(near.points.reshape(-1, 3) - x).sum(axis=1).argmin()] for x in around)
 
 
-def test_what_cannot_be_joined_is_refused():
+def test_bad_arguments_are_refused():
     grid = volume_grid(0.1, 3)
     whole = of(grid, np.ones(grid.shape))
-    with pytest.raises(InputError, match="goal .* lies 0.* m from the grid"):
+    with pytest.raises(InputError, match="goal .* lies 0.* m from the nearest point of the grid"):
         lowest_cost_path(whole, (0, 0, 0), (1, 0, 0))
     with pytest.raises(InputError, match="start is"):
         lowest_cost_path(whole, (0, np.nan, 0), (0, 0, 0))
@@ -91,8 +91,8 @@ def test_what_cannot_be_joined_is_refused():
             lowest_cost_path(whole, (0, 0, 0), (0, 0, 0.1), sharpness)
     energy = np.ones(grid.shape)
     energy[1] = np.nan
-    with pytest.raises(InputError, match="do not join"):
+    with pytest.raises(InputError, match="no path inside the grid's mask joins"):
         lowest_cost_path(of(grid, energy), (-0.1, 0, 0), (0.1, 0, 0))
     each = dataclasses.replace(whole, values=whole.values[:, None], turned=None)
-    with pytest.raises(InputError, match="each rotation"):
+    with pytest.raises(InputError, match="every rotation"):
         lowest_cost_path(each, (0, 0, 0), (0, 0, 0.1))

@@ -1,4 +1,4 @@
-"""Landscapes: what is made of a sweep's energies, and their files."""
+"""Landscapes: reductions, minimisers, and files."""
 
 import dataclasses
 import io
@@ -29,19 +29,19 @@ def landscape():
     return made(np.arange(8.0).reshape(2, 2, 2)[::-1] / 100)
 
 
-def test_the_least_and_the_mean_are_over_waypoints(landscape):
+def test_minimum_and_mean_are_over_waypoints(landscape):
     np.testing.assert_allclose(landscape.combined, np.array([[0, 1], [2, 3]]) / 100)
     np.testing.assert_allclose(dataclasses.replace(landscape, reduce="mean").combined, np.array([[2, 3], [4, 5]]) / 100)
 
 
-def test_the_soft_least_lies_between_the_least_and_the_mean(landscape):
-    soft = dataclasses.replace(landscape, reduce="soft_least", temperature=0.01)
+def test_the_softmin_lies_between_minimum_and_mean(landscape):
+    soft = dataclasses.replace(landscape, reduce="softmin", temperature=0.01)
     np.testing.assert_allclose(soft.combined, -0.01 * np.log(np.mean(np.exp(-soft.values / 0.01), axis=0)))
-    least, mean = landscape.combined, dataclasses.replace(landscape, reduce="mean").combined
+    low, mean = landscape.combined, dataclasses.replace(landscape, reduce="mean").combined
     # and does not overflow
-    np.testing.assert_allclose(dataclasses.replace(soft, temperature=1e-9).combined, least, atol=1e-8)
+    np.testing.assert_allclose(dataclasses.replace(soft, temperature=1e-9).combined, low, atol=1e-8)
     np.testing.assert_allclose(dataclasses.replace(soft, temperature=1e3).combined, mean, rtol=1e-4)
-    assert ((least < soft.combined) & (soft.combined < mean)).all()
+    assert ((low < soft.combined) & (soft.combined < mean)).all()
 
 
 def test_points_are_assigned_to_waypoints_by_their_distance_from_the_first():
@@ -57,7 +57,7 @@ def test_points_are_assigned_to_waypoints_by_their_distance_from_the_first():
     np.testing.assert_array_equal(kept.combined, [expected, np.add(expected, 10)])
 
 
-def test_minimisers_pass_over_what_does_not_count():
+def test_minimisers_skip_points_outside_the_mask():
     grid = dataclasses.replace(plane_grid(1.0, 3), mask=np.array([[0, 1, 1], [1, 1, 1], [1, 1, 1]], bool))
     values = np.full((2, 3, 3), 5.0)
     values[:, 0, 0], values[0, 1, 2], values[1, 2, 0] = np.nan, 1, 2
@@ -79,13 +79,13 @@ def test_a_file_gives_the_same_landscape(tmp_path, kind):
         rng.normal(size=(2, 3)),
         rotations,
         turned,
-        "soft_least",
+        "softmin",
         0.002,
     )
     save_landscape(tmp_path / "it.npz", first, {"seed": 3})
     again, about = load_landscape(tmp_path / "it.npz")
     assert about == {"seed": 3}
-    assert (again.reduce, again.temperature) == ("soft_least", 0.002)
+    assert (again.reduce, again.temperature) == ("softmin", 0.002)
     for name in ("values", "waypoints", "rotations", "turned", "combined", "minimisers", "minimiser_rotations"):
         np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
     np.testing.assert_array_equal(again.grid.points, grid.points)
@@ -94,7 +94,7 @@ def test_a_file_gives_the_same_landscape(tmp_path, kind):
     assert [file.name for file in tmp_path.iterdir()] == ["it.npz"]
 
 
-def test_files_that_hold_something_else_are_refused(tmp_path, landscape):
+def test_other_files_are_refused(tmp_path, landscape):
     with pytest.raises(InputError, match="no file"):
         load_landscape(tmp_path / "none.npz")
     for name in ("it.npy", "it"):
@@ -126,6 +126,6 @@ def test_files_that_hold_something_else_are_refused(tmp_path, landscape):
         ({"turned": None}, "values have shape"),
     ],
 )
-def test_landscapes_that_make_no_sense_are_refused(landscape, changes, words):
+def test_inconsistent_landscapes_are_refused(landscape, changes, words):
     with pytest.raises(InputError, match=words):
         dataclasses.replace(landscape, **changes)

@@ -1,4 +1,4 @@
-"""Whether an object is of the demonstration's category: its evidence, its curve, and the warning."""
+"""Recognition of the demonstration's category: its evidence, its curve, and the warning."""
 
 import dataclasses
 import warnings
@@ -32,17 +32,17 @@ def sphere(radius, count):
 
 
 @pytest.mark.parametrize("count", [40, 1500, 4000])
-def test_points_on_the_surface_have_logit_zero_and_others_how_far_they_are_outside(count):
+def test_the_surface_logit_is_zero_on_the_surface_and_falls_outside(count):
     for radius, logit in ((1.0, 0.0), (1.1, -1.0), (0.9, 1.0), (2.0, -3.0), (0.2, 3.0)):  # cut at three
         assert tdf.surface_logit(Ball(), sphere(radius, count)) == pytest.approx(logit, abs=1e-4)
 
 
-def test_a_stray_point_counts_no_more_than_the_cut():
+def test_the_logit_of_a_stray_point_is_clipped():
     points = np.concatenate([sphere(1.0, 99), [[0.0, 0.0, 50.0]]])
     assert tdf.surface_logit(Ball(), points) == pytest.approx(-3 / 100, abs=1e-4)
 
 
-def test_the_curve_is_logistic_in_its_evidence():
+def test_the_curve_is_logistic_in_residual_and_logit():
     for residual, logit in ((0.2, 0.0), (0.9, -1.0), (1.0, 0.5)):
         odds = np.exp(-1 - 2 * np.log(residual) + 3 * logit)
         assert tdf.recognition(residual, logit, CURVE) == pytest.approx(odds / (1 + odds))
@@ -56,7 +56,7 @@ def test_a_curve_is_three_finite_numbers(curve):
         tdf.recognition(0.5, 0.0, curve)
 
 
-def test_a_fit_finds_the_curve_that_the_cases_were_drawn_from():
+def test_a_fit_recovers_the_curve_of_simulated_cases():
     rng = np.random.default_rng(0)
     features = rng.normal(size=(20_000, 2))
     right = (rng.uniform(size=20_000) < 1 / (1 + np.exp(-(CURVE[0] + features @ CURVE[1:])))).astype(float)
@@ -76,21 +76,21 @@ def test_shipped_weights_judge_the_object_and_others_do_not(small_model, monkeyp
         polish_steps=1,
     )
 
-    def found(name, curve):
+    def imitated(name, curve):
         monkeypatch.setattr("tdf_jax.imitation.CURVES", {"mug": curve})
         model = dataclasses.replace(small_model, info=dataclasses.replace(small_model.info, name=name))
         return model, tdf.imitate(model, demonstration, other, key=KEY, config=config)
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert np.isnan(found("mine", (0.0, 0.0, 0.0))[1].recognised)
-        assert found("mug", (2.0, 0.0, 0.0))[1].recognised == pytest.approx(1 / (1 + np.exp(-2)))
+        assert np.isnan(imitated("mine", (0.0, 0.0, 0.0))[1].recognised)
+        assert imitated("mug", (2.0, 0.0, 0.0))[1].recognised == pytest.approx(1 / (1 + np.exp(-2)))
     with pytest.warns(
         tdf.CategoryWarning,
         match=r"does not look like one of the demonstration's category to the weights 'mug' \(probability 0.12\)",
     ):
-        found("mug", (-2.0, 0.0, 0.0))
-    model, result = found("mug", (0.3, 0.1, 0.1))
+        imitated("mug", (-2.0, 0.0, 0.0))
+    model, result = imitated("mug", (0.3, 0.1, 0.1))
     evidence = result.residual, tdf.surface_logit(tdf.encode(model, other), other)
     assert result.recognised == pytest.approx(tdf.recognition(*evidence, (0.3, 0.1, 0.1)))
 
@@ -102,7 +102,7 @@ def test_shipped_weights_judge_the_object_and_others_do_not(small_model, monkeyp
     ("multi", "bottle", "bottle", False),
     ("multi", "bottle", "mug", True),  # it knows both
 ])  # fmt: skip
-def test_an_object_of_another_category_is_noticed(weights, shown, category, doubted):
+def test_imitate_warns_of_another_category(weights, shown, category, doubted):
     case, target = generated_case(shown, 0, 1), generated_case(category, 0, 1)
     demonstration = place_demonstration(case, "line", 2, tdf.box_query(KEY, 128, QUERY_SIZE))
     with warnings.catch_warnings(record=True) as issued:

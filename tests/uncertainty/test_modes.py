@@ -1,4 +1,4 @@
-"""Modes: which starts count as one pose; curvature and covariance of a pose, and the directions an energy leaves free."""
+"""Modes of several candidates; curvature, covariance and free directions of one pose."""
 
 import dataclasses
 
@@ -23,8 +23,11 @@ BOUNDS = {"angle": np.radians(10), "distance": 0.01}
 # ---- clusters ----
 
 
-def made(*steps, base=random_poses(0, 1)[0]):
-    """Poses a turn about x, degrees, and a distance along y, metres, away from a base, both in its frame."""
+BASE = random_poses(0, 1)[0]
+
+
+def made(*steps, base=BASE):
+    """Poses that differ from a base by a rotation about its x, degrees, and a translation along its y, metres."""
     rotations = Rotation.from_quat(base[:4], scalar_first=True) * Rotation.from_rotvec(
         [[np.radians(degrees), 0, 0] for degrees, _ in steps]
     )
@@ -36,7 +39,7 @@ def members(found):
     return [mode.members.tolist() for mode in found]
 
 
-def test_starts_are_gathered_from_the_least_energy_upwards():
+def test_candidates_join_modes_by_rising_energy():
     """0, 8 and 16 degrees: the last is near the second but not near the first, which leads."""
     found = cluster_poses(made((16, 0), (8, 0), (0, 0), (90, 0)), np.array([0.4, 0.2, 0.1, 0.3]), **BOUNDS)
     assert members(found) == [[2, 1], [3], [0]]
@@ -48,7 +51,7 @@ def test_starts_are_gathered_from_the_least_energy_upwards():
 
 
 @pytest.mark.parametrize(("step", "together"), [((9.9, 0.0099), True), ((10.1, 0.0), False), ((0.0, 0.0101), False)])
-def test_turn_and_distance_both_have_to_be_within_their_bounds(step, together):
+def test_rotation_and_distance_both_have_to_be_within_their_bounds(step, together):
     found = cluster_poses(made((0, 0), step), np.array([0.1, 0.2]), **BOUNDS)
     assert members(found) == ([[0, 1]] if together else [[0], [1]])
 
@@ -60,7 +63,7 @@ def test_a_quaternion_and_its_opposite_are_one_rotation_and_half_turns_close_up(
         assert members(cluster_poses(signed, np.array([1.0, 2.0, 3.0]), **BOUNDS)) == [[0, 1], [2]]
 
 
-def test_starts_that_are_not_finite_are_left_out_and_do_not_count():
+def test_candidates_that_are_not_finite_belong_to_no_mode():
     there, energies = made(*[(0, 0)] * 4, (90, 0), (0, 0)), np.array([np.nan, 0.3, np.inf, 0.2, 0.5, 0.1])
     there[5, 6] = np.nan
     found = cluster_poses(there, energies, **BOUNDS)
@@ -68,7 +71,7 @@ def test_starts_that_are_not_finite_are_left_out_and_do_not_count():
     assert cluster_poses(there[:1], energies[:1]) == []
 
 
-def test_one_start_is_one_mode():
+def test_one_candidate_is_one_mode():
     (mode,) = cluster_poses(made((30, 0)), np.array([0.7]))
     assert mode.members.tolist() == [0] and mode.share == 1 and mode.energy == 0.7
 
@@ -83,7 +86,7 @@ def scattered():
     return np.concatenate([made(step, base=place) for place, step in zip(places, steps)]), rng.permutation(40) / 40
 
 
-def test_the_order_of_the_starts_does_not_show(scattered):
+def test_modes_do_not_depend_on_the_order_of_the_candidates(scattered):
     there, energies = scattered
     found = cluster_poses(there, energies)
     assert 5 <= len(found) < 40 and [mode.energy for mode in found] == sorted(mode.energy for mode in found)
@@ -93,7 +96,7 @@ def test_the_order_of_the_starts_does_not_show(scattered):
     assert sorted(sum(members(found), [])) == list(range(40))
 
 
-def test_a_motion_of_all_changes_nothing(scattered):
+def test_modes_are_equivariant_under_rigid_motions(scattered):
     there, energies = scattered
     motion = random_poses(8, 1, 3.0)[0]
     found, moved = cluster_poses(there, energies), cluster_poses(composed(motion, there), energies)
@@ -107,12 +110,12 @@ def test_a_motion_of_all_changes_nothing(scattered):
     [
         (np.ones((2, 1, 7)), np.ones(2), {}, r"poses have shape \(2, 1, 7\).*result.trajectories\[:, 0\]"),
         (np.ones((2, 7)), np.ones(3), {}, r"poses have shape \(2, 7\) and energies \(3,\)"),
-        (np.zeros((2, 7)), np.ones(2), {}, "the quaternion of start 0 has length 0"),
+        (np.zeros((2, 7)), np.ones(2), {}, "the quaternion of candidate 0 has length 0"),
         (np.ones((2, 7)), np.ones(2), {"angle": -0.1}, "angle is -0.1"),
         (np.ones((2, 7)), np.ones(2), {"distance": np.nan}, "distance is nan"),
     ],
 )
-def test_bad_starts_are_refused(there, energies, bounds, message):
+def test_bad_candidates_are_refused(there, energies, bounds, message):
     with pytest.raises(InputError, match=rf"cluster_poses\(\): {message}"):
         cluster_poses(there, energies, **bounds)
 
@@ -140,7 +143,7 @@ R_WORLD_QUERY, OFFSET = Rotation.random(random_state=3).as_matrix(), np.array([0
 
 
 def squares(weights):
-    """Field, reference and a pose with its query points along the world's axes, and the curvatures there of turns and moves."""
+    """Field, reference, a pose with its query points along the world's axes, and the curvatures of its twists."""
     arms = np.concatenate([np.diag(EXTENTS), -np.diag(EXTENTS)])
     query = jnp.asarray(arms @ R_WORLD_QUERY + OFFSET, jnp.float32)
     pose = se3.pose(jnp.asarray(R_WORLD_QUERY, jnp.float32), jnp.asarray(-R_WORLD_QUERY @ OFFSET, jnp.float32))
@@ -161,7 +164,7 @@ def test_a_quadratic_energy_has_its_own_curvature_and_covariance():
     assert found.free.shape == (0, 6) and found.screws == []
 
 
-def test_an_energy_that_ignores_one_axis_leaves_a_move_free():
+def test_an_energy_that_ignores_one_axis_has_a_free_translation():
     field, reference, pose, expected = squares((0.0, 3.0, 8.0))
     found = pose_covariance(field, reference, pose, scale=2e-6)
     np.testing.assert_allclose(np.abs(found.free), [[0, 0, 0, 1, 0, 0]], atol=2e-3)
@@ -185,14 +188,14 @@ def test_a_direction_is_free_below_its_share_of_the_stiffest(weight, count):
     np.testing.assert_allclose(np.diagonal(found.covariance), 2 * 2e-6 / expected, rtol=0.02)
 
 
-def test_where_nothing_changes_everything_is_free():
+def test_under_a_constant_energy_every_direction_is_free():
     field, reference, pose, _ = squares((0.0, 0.0, 0.0))
     found = pose_covariance(field, reference, pose)
     assert found.free.shape == (6, 6)
     np.testing.assert_allclose(found.covariance, np.diag([1.0] * 3 + [found.rotation_scale**2] * 3), atol=1e-6)
 
 
-def test_where_the_energy_falls_the_curvature_is_negative_and_the_direction_counts_as_free():
+def test_a_direction_of_falling_energy_has_negative_curvature_and_is_free():
     """The weights the other way around: the points' longest axis lies where the energy is steepest."""
     field, reference, pose, expected = squares((8.0, 3.0, 1.0))
     found = pose_covariance(field, reference, pose, scale=2e-6)
@@ -211,7 +214,7 @@ def test_where_the_energy_falls_the_curvature_is_negative_and_the_direction_coun
         ((0, 0, 0, 0, 0.6, 0.8), (0, 0.6, 0.8), (0.1, 0.3, 0.1), np.inf),
     ],
 )
-def test_a_twist_is_a_motion_about_an_axis(twist, direction, point, pitch):
+def test_a_twist_is_a_screw_motion(twist, direction, point, pitch):
     centre = np.array([0.1, 0.3, 0.1])
     screw = covariance_module._screw(np.array(twist, float), centre, 0.03)
     np.testing.assert_allclose(screw.direction, direction, atol=1e-12)
@@ -222,13 +225,13 @@ def test_a_twist_is_a_motion_about_an_axis(twist, direction, point, pitch):
         np.testing.assert_allclose(np.cross(turn, centre - screw.point) + pitch * turn, twist[3:], atol=1e-12)
 
 
-def test_twists_are_turns_about_their_axis_at_any_angle():
+def test_a_twist_without_pitch_rotates_about_its_axis_at_any_angle():
     rng = np.random.default_rng(0)
     axis, point, centre = rng.normal(size=3), rng.normal(size=3), rng.normal(size=3)
     axis *= 2.5 / np.linalg.norm(axis)
     for share in (1e-6, 0.01, 1.0):
         turn = share * axis
-        R, moved = covariance_module._screwed(
+        R, moved = covariance_module._screw_motion(
             jnp.eye(3), jnp.asarray(turn, jnp.float32), jnp.asarray(np.cross(turn, centre - point), jnp.float32)
         )
         expected = Rotation.from_rotvec(turn)
@@ -273,7 +276,7 @@ def test_one_sigma_along_the_axes_raises_the_energy_by_the_scale(shown, referenc
     np.testing.assert_allclose(measured @ directions.T, np.eye(6), atol=1e-5)
 
 
-def test_it_turns_and_moves_with_object_and_pose(small_model, field, reference, demonstration):
+def test_the_covariance_is_equivariant_under_rigid_motions(small_model, field, reference, demonstration):
     motion = random_poses(6, 1, 0.5)[0]
     R = np.kron(np.eye(2), Rotation.from_quat(motion[:4], scalar_first=True).as_matrix())
     pose = np.asarray(demonstration.trajectory.wxyz_xyz[2], np.float64)
@@ -318,7 +321,7 @@ def test_waypoints_poses_and_scales_share_one_program(shown, reference, demonstr
         ({"pose": np.ones((2, 7))}, r"pose has shape \(2, 7\).*jax.vmap"),
         ({"pose": np.zeros(7)}, "pose is"),
         ({"pose": np.full(7, np.nan)}, "pose is"),
-        ({"waypoint": 4}, "waypoint is 4.*4 waypoints"),
+        ({"waypoint": 4}, "waypoint is 4; expected a whole number from -4 to 3"),
         ({"waypoint": 1.0}, "waypoint is 1.0"),
         ({"scale": 0.0}, "scale is 0.0"),
         ({"scale": np.inf}, "scale is inf"),
@@ -329,9 +332,9 @@ def test_bad_settings_are_refused(shown, reference, settings, message):
         pose_covariance(shown, reference, **{"pose": random_poses(0, 1)[0], **settings})
 
 
-def test_query_points_at_one_place_are_refused(shown, reference):
+def test_coinciding_query_points_are_refused(shown, reference):
     one = dataclasses.replace(reference, query=jnp.ones((8, 3)))
-    with pytest.raises(InputError, match="all query points are at one place"):
+    with pytest.raises(InputError, match="all query points coincide"):
         pose_covariance(shown, one, random_poses(0, 1)[0])
 
 
@@ -342,8 +345,10 @@ QUERIES = 64
 
 
 def cup(seed, bottom, top, height=0.1, folds=8):
-    """256 points of an open cup: 32 at random on an eighth of it, turned about z. No two distances are equal but by symmetry, so that the
-    neighbours, and with them the field, have the symmetry."""
+    """256 points of an open cup: 32 random points on an eighth of it, rotated about z.
+
+    Distances are equal only by symmetry, so the neighbours, and with them the field, have the symmetry.
+    """
     rng = np.random.default_rng(seed)
     up, part = rng.uniform(size=32), rng.choice(3, 32, p=[0.45, 0.4, 0.15])  # outside, inside, floor
     radius = np.choose(part, [bottom + (top - bottom) * up, bottom + (top - bottom) * up - 0.004, bottom * np.sqrt(up)])
@@ -385,7 +390,7 @@ def at(*place):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("place", [at(-0.04, 0, 0.05), at(0.06, 0, 0), at(0, 0, 0.05)], ids=["rim", "side", "axis"])
-def test_a_cup_without_handle_is_free_to_turn_about_its_axis(mug_model, query, place, quick_compilation):
+def test_a_cup_without_a_handle_has_a_free_rotation_about_its_axis(mug_model, query, place, quick_compilation):
     found = transferred(mug_model, query, cup(0, 0.040, 0.045), cup(1, 0.038, 0.043), place)
     assert (
         found.values[0] < 0.005 * found.values[-1] and found.values[1] > 2 * covariance_module.FREE * found.values[-1]
@@ -398,7 +403,7 @@ def test_a_cup_without_handle_is_free_to_turn_about_its_axis(mug_model, query, p
 
 
 @pytest.mark.slow
-def test_a_mug_with_a_handle_is_not(mug_model, query, quick_compilation):
+def test_a_mug_with_a_handle_has_no_free_direction(mug_model, query, quick_compilation):
     a, b = tdf.build_mug(), tdf.build_mug(tdf.sample_mug(np.random.default_rng(77)))
     clouds = (np.asarray(tdf.sample_surface(one.mesh, 1500, 0)) for one in (a, b))
     found = transferred(mug_model, query, *clouds, a.handle_frame)
