@@ -289,7 +289,7 @@ def test_a_contact_sheet_shows_generated_and_real_objects(real, tmp_path, monkey
 
 
 @pytest.mark.parametrize(("words", "message"), [
-    (("--count", 0), "--count is 0; expected at least 1"),
+    (("--count", 0), "--count is 0; expected a whole number of at least 1"),
     (("--seed", -1), "--seed is -1"),
     (("--out", "none/sheet.png"), "--out is none/sheet.png; expected a .png in an existing folder"),
     (("--out", "sheet.jpg"), "--out is sheet.jpg"),
