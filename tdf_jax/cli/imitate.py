@@ -63,7 +63,7 @@ def _run(settings: Settings, folder: Path) -> dict:
         energy = None
         if not isinstance(config, CarryConfig):
             energy = EnergyWeights() if settings.k is None else EnergyWeights(settings.k)
-        model = load_model(settings.weights)
+        model = load_model(str(settings.weights))  # `resolved` has put the name of the category's weights
         scene = make_scene(settings, query_key)
     with _timed(seconds, "encode"):
         reference = jax.block_until_ready(describe(model, scene.demonstration))

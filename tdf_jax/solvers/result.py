@@ -170,4 +170,4 @@ def _distinct_picks(result: Result) -> int:
     # Display may look at what comes after the solvers: tests/test_layout.py lists this import.
     from tdf_jax.uncertainty.modes import cluster_poses
 
-    return len(cluster_poses(result.trajectories[:, 0], result.energies))
+    return len(cluster_poses(jnp.asarray(result.trajectories)[:, 0], jnp.asarray(result.energies)))

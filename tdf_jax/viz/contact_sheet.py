@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from tdf_jax.viz.polygons3d import surface
-from tdf_jax.viz.style import LIGHT, STYLE, blank_figure
+from tdf_jax.viz.style import LIGHT, STYLE, blank_figure, set_view
 
 if TYPE_CHECKING:
     import trimesh
@@ -29,8 +29,7 @@ def contact_sheet(objects: "Sequence[tuple[str, trimesh.Trimesh]]", columns: int
             axes = figure.add_subplot(lines, columns, number + 1, projection="3d")
             axes.add_collection3d(surface(np.asarray(mesh.triangles) - mesh.bounds.mean(axis=0), LIGHT).collection())
             axes.set(xlim=(-half, half), ylim=(-half, half), zlim=(-half, half))
-            axes.set_box_aspect((1, 1, 1), zoom=1.45)
-            axes.view_init(elev=25, azim=-60)
+            set_view(axes, (1, 1, 1), 1.45, {"elev": 25, "azim": -60})
             axes.set_axis_off()
             axes.set_title(title, y=-0.12, va="top", fontsize=6)
         figure.subplots_adjust(left=0, right=1, bottom=0.07, top=1, wspace=0, hspace=0.12)
