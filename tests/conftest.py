@@ -23,6 +23,12 @@ import pytest
 from flax.traverse_util import unflatten_dict
 from scipy.spatial.transform import Rotation
 
+if "TDF_CHECK_TYPES" in os.environ:  # as `make test-types` does: every annotation is checked, shapes included
+    import jaxtyping
+
+    CHECKED = ("geometry", "io", "networks", "energy", "landscape", "shapes")
+    jaxtyping.install_import_hook([f"tdf_jax.{package}" for package in CHECKED], "typecheck.checked")
+
 import tdf_jax as tdf
 from tdf_jax.networks.field import DescriptorField
 from tdf_jax.networks.occupancy import OccupancyNetwork, condition, parameter_shapes
@@ -52,7 +58,15 @@ def pytest_collection_modifyitems(items):
 
 FIXTURES = Path(__file__).parent / "fixtures"
 TOLERANCE = {"float32": 5e-5, "float64": 1e-10}
+# With clouds of as many points and as many poses, query points and starts, most tests share compiled programs.
+POINTS, POSES, QUERIES, STARTS = 40, 4, 8, 3
+CARRY = tdf.CarryConfig(
+    num_starts=8, num_coarse_queries=3, coarse_steps=2, prune_steps=2, refine_steps=3, polish_steps=6, num_candidates=3
+)
 SMALL = tdf.NetworkConfig(latent=4, vector_hidden=6, vector_width=12, decoder_width=8, blocks=2)
+
+
+trajectory_energy = jax.jit(tdf.trajectory_energy)  # the same program for all tests
 
 
 def relative_error(found, expected) -> float:
@@ -89,7 +103,7 @@ def composed(motion, wxyz_xyz):
     return np.concatenate([turned.as_quat(scalar_first=True), carried(motion, wxyz_xyz[:, 4:])], axis=1)
 
 
-def random_cloud(seed, count=40):
+def random_cloud(seed, count=POINTS):
     """A lopsided cloud of a mug's size, away from the world's origin, float64."""
     rng = np.random.default_rng(seed)
     return rng.normal(size=(count, 3)) * (0.05, 0.03, 0.02) + rng.gamma(1.0, 0.03, size=(count, 3)) + (0.3, -0.2, 0.1)
@@ -164,17 +178,16 @@ def small_model():
 def weights(small_model, tmp_path_factory):
     """A file of the small network's weights, for commands."""
     path = tmp_path_factory.mktemp("weights") / "small.safetensors"
-    tdf.save_model(dataclasses.replace(small_model, info=tdf.ModelInfo("small", "a test", cloud_points=40)), path)
+    tdf.save_model(dataclasses.replace(small_model, info=tdf.ModelInfo("small", "a test", cloud_points=POINTS)), path)
     return path
 
 
 @pytest.fixture(scope="session")
 def demonstration():
-    """4 poses, 8 query points: with clouds of 40 points, the shapes that most tests share, to compile once."""
     return tdf.Demonstration(
         jnp.asarray(random_cloud(0), jnp.float32),
-        tdf.Trajectory(jnp.asarray(random_poses(1, 4) + [0, 0, 0, 0, 0.3, -0.2, 0.1], jnp.float32)),
-        tdf.box_query(jax.random.key(2), count=8, size=0.05, centre=(0.01, 0.02, 0.03)),
+        tdf.Trajectory(jnp.asarray(random_poses(1, POSES) + [0, 0, 0, 0, 0.3, -0.2, 0.1], jnp.float32)),
+        tdf.box_query(jax.random.key(2), count=QUERIES, size=0.05, centre=(0.01, 0.02, 0.03)),
     )
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from conftest import compilations, random_cloud, random_poses
+from conftest import CARRY, compilations, random_cloud, random_poses
 
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
@@ -124,28 +124,13 @@ def test_bad_input_is_refused(imitate, reference, settings, message):
         imitate(reference, **settings)
 
 
-@pytest.mark.parametrize(
-    "config",
-    [
-        CONFIG,
-        tdf.SolveConfig(
-            num_trajectory_starts=3,
-            num_starts=3,
-            num_coarse_queries=8,
-            coarse_steps=2,
-            prune_steps=2,
-            search_steps=2,
-            propagate_steps=2,
-            refine_steps=2,
-            polish_steps=2,
-        ),
-    ],
-)
-def test_a_demonstration_of_one_pose_is_found_where_it_is_free(imitate, demonstration, config):
+@pytest.mark.parametrize("starts", [3, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("config", [CONFIG, CARRY.solver])
+def test_a_demonstration_of_one_pose_is_found_where_it_is_free(imitate, demonstration, config, starts):
     one = dataclasses.replace(demonstration, trajectory=tdf.Trajectory(demonstration.trajectory.wxyz_xyz[:1]))
-    for inits in (3, 1):
-        result = imitate(one, fix_last=False, config=dataclasses.replace(config, num_starts=inits))
-        assert result.trajectory.num_poses == 1 and np.isfinite(result.energies).all()
+    counts = {"num_starts": starts} if config is CONFIG else {"num_trajectory_starts": starts}
+    result = imitate(one, fix_last=False, config=dataclasses.replace(config, **counts))
+    assert result.trajectory.num_poses == 1 and np.isfinite(result.energies).all()
     with pytest.raises(InputError, match="one pose and fix_last keeps it; expected fix_last=False"):
         imitate(one, config=config)
 

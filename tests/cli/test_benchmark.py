@@ -122,6 +122,7 @@ def test_the_page_tells_the_command_that_made_it(folder, weights):
     assert "demonstrations" not in told(folder).split("`")[1]
 
 
+@pytest.mark.slow
 def test_the_methods_are_told_as_a_shell_takes_them(everything):
     words = shlex.split(told(everything).split("`")[1])
     after = words[words.index("--methods") + 1 :]
@@ -131,6 +132,7 @@ def test_the_methods_are_told_as_a_shell_takes_them(everything):
     ]
 
 
+@pytest.mark.slow
 def test_the_path_of_the_page_is_printed(folder, weights, capsys):
     run("--weights", weights, *PLAIN, "--out", folder)
     assert capsys.readouterr().out == f"{folder / 'benchmark.md'}\n"
@@ -178,6 +180,7 @@ def everything(folder, weights, real, tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_clouds_meshes_and_demonstrations_add_to_what_there_was(folder, everything, real):
     record, before = read(everything), read(folder)
     kinds = [(one["clouds"], one["instance"], one["task"], one["method"]) for one in record["tasks"]]
@@ -201,11 +204,13 @@ def test_clouds_meshes_and_demonstrations_add_to_what_there_was(folder, everythi
     )
 
 
+@pytest.mark.slow
 def test_real_meshes_are_of_their_own_size_with_a_penetration(everything):
     ours = [one for one in read(everything)["tasks"] if one["instance"] == "cup"]
     assert all(one["penetration"] is not None for one in ours)
 
 
+@pytest.mark.slow
 def test_demonstrations_are_of_every_fifth_task_of_all_clouds(everything):
     expected = len(
         [
@@ -222,6 +227,7 @@ def test_demonstrations_are_of_every_fifth_task_of_all_clouds(everything):
     assert all(len(one["distances"]) == len(one["angles"]) == expected for one in found)
 
 
+@pytest.mark.slow
 def test_real_meshes_alone_with_the_paths_in_turn(weights, real, tmp_path):
     shutil.copytree(real, two := tmp_path / "two")
     shutil.copy(two / "cup.obj", two / "mug.obj")
@@ -267,6 +273,7 @@ def test_all_methods_is_every_method(weights, tmp_path, monkeypatch):
     assert asked == [list(METHODS)] * 2
 
 
+@pytest.mark.slow
 def test_pictures_show_every_path_and_goals_where_there_are_enough_tasks(weights, tmp_path, monkeypatch):
     seen = []
     monkeypatch.setattr(

@@ -10,6 +10,7 @@ import zipfile
 import jax
 import numpy as np
 import pytest
+from conftest import POSES, QUERIES, STARTS
 
 import tdf_jax as tdf
 from tdf_jax.cli import imitate as report, main as command_line, options as scene
@@ -22,8 +23,8 @@ from tdf_jax.io.demonstrations import save_demonstration
 from tdf_jax.networks.checkpoint import load_model, save_model
 from tdf_jax.shapes import build_mug
 
-QUICK = ("--method", "adam", "--num-starts", 2, "--iterations", 3, "--points", 60)
-TINY = (*QUICK, "--num-poses", 4, "--queries", 8)
+QUICK = ("--method", "adam", "--num-starts", STARTS, "--iterations", 3, "--points", 60)
+TINY = (*QUICK, "--num-poses", POSES, "--queries", QUERIES)
 FILES = {"result.json", "trajectory.npz", "trajectory.tum", "imitation.png", "loss.png"}
 
 
@@ -129,13 +130,13 @@ def test_the_record_tells_all_settings(folder, weights):
     assert (record["schema"], record["tdf_jax"], record["seed"]) == (report.SCHEMA, tdf.__version__, 0)
     assert record["settings"] == {
         "target": None, "scale": 1.0, "target_pose": "random", "demonstration": None, "category": "mug", "trajectory": "wave",
-        "goal_offset": [0.0, 0.0, 0.0], "k": None, "method": "adam", "num_starts": 2, "num_poses": 4, "queries": 8, "iterations": 3, "points": 60,
+        "goal_offset": [0.0, 0.0, 0.0], "k": None, "method": "adam", "num_starts": 3, "num_poses": 4, "queries": 8, "iterations": 3, "points": 60,
         "seed": 0, "weights": str(weights), "out": str(folder), "no_plots": False, "json": False,
     }  # fmt: skip
     assert record["energy"] == dataclasses.asdict(tdf.EnergyWeights(0.02))
-    assert record["optimiser"] == dataclasses.asdict(tdf.OptimizeConfig(num_starts=2, iterations=3))
+    assert record["optimiser"] == dataclasses.asdict(tdf.OptimizeConfig(num_starts=3, iterations=3))
     assert record["weights"]["name"] == "small"
-    assert record["status"] == "all 2 starts finite"
+    assert record["status"] == "all 3 starts finite"
     seconds = record["seconds"]
     assert list(seconds) == ["load", "encode", "optimise", "plots", "total"]
     assert 0 < sum(value for name, value in seconds.items() if name != "total") <= seconds["total"] * 1.001
@@ -144,7 +145,7 @@ def test_the_record_tells_all_settings(folder, weights):
 def test_the_record_keeps_every_start_and_the_best_is_the_least(folder):
     record = record_of(folder)
     losses, energies = np.array(record["losses"]), np.array(record["energies"])
-    assert losses.shape == (2, 3) and energies.shape == (2,)
+    assert losses.shape == (3, 3) and energies.shape == (3,)
     assert record["best"] == np.argmin(energies)
     assert record["loss"] == {"start": losses[record["best"], 0], "end": energies.min()}
 
@@ -210,7 +211,7 @@ def test_the_table(folder, weights, tmp_path, capsys):
         "run", "loss, start", "loss, end", "pick-pose error", "path error", "time", "written to"
     ]  # fmt: skip
     assert rows["loss, start"] == f"{record['loss']['start']:.5f}"
-    assert rows["loss, end"].startswith(f"{record['loss']['end']:.5f} (start {record['best'] + 1} of 2")
+    assert rows["loss, end"].startswith(f"{record['loss']['end']:.5f} (start {record['best'] + 1} of 3")
     degrees = np.degrees(record["errors"]["pick_radians"])
     assert rows["pick-pose error"] == f"{100 * record['errors']['pick_metres']:.2f} cm, {degrees:.1f} degrees"
     assert rows["path error"].startswith(f"{100 * record['errors']['path_metres']:.2f} cm")
@@ -716,10 +717,10 @@ def test_a_bug_keeps_its_traceback(monkeypatch, tmp_path):
 
 def test_every_start_non_finite_is_told(refusal, weights, monkeypatch):
     def broken(*arguments, **options):
-        return dataclasses.replace(tdf.imitate(*arguments, **options), energies=np.full(2, np.nan))
+        return dataclasses.replace(tdf.imitate(*arguments, **options), energies=np.full(3, np.nan))
 
     monkeypatch.setattr("tdf_jax.cli.imitate.imitate_scene", broken)
-    check(refusal("imitate", "--weights", weights, *TINY), "^imitating.* 2 of 2 starts became non-finite: 0, 1")
+    check(refusal("imitate", "--weights", weights, *TINY), "^imitating.* 3 of 3 starts became non-finite: 0, 1, 2")
 
 
 def test_commands_are_the_functions_of_their_modules():

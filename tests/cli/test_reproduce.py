@@ -5,7 +5,7 @@ import dataclasses
 import matplotlib
 import numpy as np
 import pytest
-from conftest import random_poses
+from conftest import POINTS, POSES, QUERIES, STARTS, random_poses
 
 import tdf_jax as tdf
 from tdf_jax.cli import reproduce as command
@@ -16,14 +16,14 @@ from tdf_jax.paper.runs import Run
 from tdf_jax.paper.setting import Setting
 from tdf_jax.viz import paper as pictures
 
-TINY = Setting(num_poses=3, iterations=2, queries=8, num_starts=2)
-WORDS = ("--num-poses", "3", "--iterations", "2", "--queries", "8", "--num-starts", "2")
+TINY = Setting(num_poses=POSES, iterations=2, queries=QUERIES, num_starts=STARTS)
+WORDS = ("--num-poses", str(POSES), "--iterations", "2", "--queries", str(QUERIES), "--num-starts", str(STARTS))
 
 
 @pytest.fixture(scope="module", autouse=True)
 def small():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(settings, "POINTS", 40)
+        patch.setattr(settings, "POINTS", POINTS)
         patch.setattr(command, "FAST", {})
         patch.setattr(command, "FAST_GRID", 4)
         patch.setattr(table, "FAST_VARIATIONS", ("k = 0", "l_p for l_c, infinity"))

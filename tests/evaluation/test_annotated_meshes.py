@@ -156,6 +156,7 @@ def test_the_sampled_shapes_have_every_symmetry(sampled):
     assert {shape.fold for shape in sampled["bottle"]} == {0, 1, 2, 4}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("category", ["bowl", "bottle"])
 def test_scans_are_measured_like_clean_meshes(sampled, category):
     """A tenth of the faces is missing, vertices are off by 0.3 mm, all leans by a degree."""

@@ -160,7 +160,7 @@ def test_commands_name_the_families():
     assert typing.get_args(Category) == tuple(FAMILIES)
 
 
-@pytest.mark.parametrize("category", ["bowl", "bottle"])
+@pytest.mark.parametrize("category", ["bowl", pytest.param("bottle", marks=pytest.mark.slow)])
 def test_a_scene_begins_at_the_categorys_place_and_ends_on_a_shelf(category):
     settings = resolved(Settings(category=category, queries=8, points=60, seed=3))
     made = options.make_scene(settings, jax.random.key(0))
@@ -182,7 +182,7 @@ def test_a_scene_begins_at_the_categorys_place_and_ends_on_a_shelf(category):
 
 
 def test_a_bowl_is_imitated_by_the_command(weights, tmp_path, capsys):
-    words = ("--method", "adam", "--num-starts", 2, "--iterations", 3, "--points", 60, "--num-poses", 4, "--queries", 8)
+    words = ("--method", "adam", "--num-starts", 3, "--iterations", 3, "--points", 60, "--num-poses", 4, "--queries", 8)
     run("imitate", "--category", "bowl", "--weights", weights, "--out", tmp_path / "out", *words)
     record = json.loads((tmp_path / "out" / "result.json").read_text())
     assert record["settings"]["category"] == "bowl" and record["settings"]["trajectory"] == "lift_over"

@@ -1338,6 +1338,7 @@ def test_failures_of_others_are_not_listed(model):
     assert "0 are off" in page([made(1.0, 90.0, method="PCA"), made()], model, SETTINGS, {})
 
 
+@pytest.mark.slow
 def test_without_confidences_and_demonstrations_their_parts_are_left_out(many, model, text):
     assert sections([made()], []) == {}
     bare = page(many, model, SETTINGS, {})
@@ -1363,6 +1364,7 @@ def test_several_demonstrations_are_told(text):
     assert rows[1][:4] == ["full", "3", "median", "3"] and rows[1][6:] == ["67 %", "100 %", "100 %"]
 
 
+@pytest.mark.slow
 def test_clouds_have_tables_of_their_own(many, model):
     noisy = [dataclasses.replace(one, clouds="noise", distances=[2 * x for x in one.distances]) for one in many]
     text = page(many + noisy, model, SETTINGS | {"clouds": ("full", "noise")}, {})

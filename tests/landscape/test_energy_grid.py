@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import compilations, random_cloud, random_poses
+from conftest import compilations, random_cloud, random_poses, trajectory_energy
 
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
@@ -24,7 +24,7 @@ def one_by_one(field, reference, grid, R, index):
     """Every waypoint's energy at a grid point: that of a trajectory of one pose, without the correlation term."""
     at = tdf.Trajectory(se3.pose(jnp.asarray(R, jnp.float32), jnp.asarray(grid.points[index], jnp.float32))[None])
     alone = [dataclasses.replace(reference, descriptors=one[None], trajectory=at) for one in reference.descriptors]
-    return np.array([tdf.trajectory_energy(at, field, one, tdf.EnergyWeights(0.0)) for one in alone])
+    return np.array([trajectory_energy(at, field, one, tdf.EnergyWeights(0.0)) for one in alone])
 
 
 def check(field, reference, landscape, R, indices, values=None):

@@ -25,6 +25,7 @@ def mug():
     return model, tdf.encode(model, points), points
 
 
+@pytest.mark.slow
 def test_the_points_come_to_lie_on_the_surface(mug):
     model, field, points = mug
     misses = [miss(tdf.refine(model, field, points, steps), points) for steps in (0, 10, 40)]
@@ -32,6 +33,7 @@ def test_the_points_come_to_lie_on_the_surface(mug):
     assert misses[1] < 0.8 * misses[0] and misses[2] < 0.5 * misses[0]
 
 
+@pytest.mark.slow
 def test_a_refined_field_moves_and_turns_with_the_points(mug):
     model, field, points = mug
     R, shift = np.asarray(se3.rotation(random_poses(3, 1)[0]), np.float32), np.array([0.3, -0.1, 0.2], np.float32)
@@ -57,7 +59,7 @@ def test_points_are_counted_once_however_few_there_are(small_model, monkeypatch)
         shape = tdf.DescriptorField(refinement.condition(small_model.params, small_model.config, latent), field.origin)
         return jnp.mean((shape.occupancy(points) - 0.5) ** 2)
 
-    gradient = np.asarray(jax.grad(mean)(field.latent))
+    gradient = np.asarray(jax.jit(jax.grad(mean))(field.latent))
     # The first step of every vector that moves is as long as the rate says, against its gradient.
     size = np.sqrt(np.mean(np.sum(np.asarray(field.latent) ** 2, axis=-1)))
     expected = field.latent - refinement.RATE * size * gradient / np.linalg.norm(gradient, axis=-1, keepdims=True)
@@ -80,7 +82,7 @@ def test_clouds_of_all_sizes_and_steps_run_one_program(small_model):
     assert "jit(_refine)" not in names
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [pytest.param(np.float32, marks=pytest.mark.slow), np.float64])
 def test_numbers_keep_their_precision_where_64_bits_are_enabled(small_model, dtype):
     with enabled("float64"):
         points = random_cloud(2, 40).astype(dtype)

@@ -7,7 +7,7 @@ import io
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import random_poses
+from conftest import POINTS, POSES, QUERIES, STARTS, random_poses, trajectory_energy
 from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
@@ -19,13 +19,13 @@ from tdf_jax.paper.runs import Run, imitation
 from tdf_jax.paper.setting import Setting
 from tdf_jax.paper.store import Store
 
-TINY = Setting(num_poses=3, iterations=4, queries=8, num_starts=2)
+TINY = Setting(num_poses=POSES, iterations=4, queries=QUERIES, num_starts=STARTS)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def small():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(settings, "POINTS", 40)
+        patch.setattr(settings, "POINTS", POINTS)
         yield
 
 
@@ -194,8 +194,8 @@ def test_settings_that_make_no_sense_are_refused(changes):
 
 
 def test_a_run_keeps_every_start_and_its_losses(run):
-    assert run.initial_trajectories.shape == run.trajectories.shape == (2, 3, 7)
-    assert run.losses.shape == (2, 5)
+    assert run.initial_trajectories.shape == run.trajectories.shape == (STARTS, POSES, 7)
+    assert run.losses.shape == (STARTS, 5)
     assert run.loss == run.losses[:, -1].min()
     assert run.start_loss == run.losses[run.best, 0]
     np.testing.assert_array_equal(run.trajectory, run.trajectories[run.best])
@@ -208,11 +208,12 @@ def test_a_run_is_the_optimisation_of_its_settings(small_model, run):
     reference = tdf.describe(small_model, scene.demonstration)
     field = tdf.encode(small_model, scene.points)
     weights = tdf.EnergyWeights(0.02, 0.0, 0.05)
-    energy = tdf.trajectory_energy(tdf.Trajectory(jnp.asarray(run.trajectory)), field, reference, weights)
+    energy = trajectory_energy(tdf.Trajectory(jnp.asarray(run.trajectory)), field, reference, weights)
     np.testing.assert_allclose(run.loss, energy, rtol=1e-4)
-    descriptor = tdf.descriptor_loss(tdf.Trajectory(jnp.asarray(run.expected)), field, reference)
+    alone = tdf.EnergyWeights(0.0)
+    descriptor = trajectory_energy(tdf.Trajectory(jnp.asarray(run.expected)), field, reference, alone)
     np.testing.assert_allclose(run.descriptor[1], descriptor, rtol=1e-4)
-    energy = tdf.trajectory_energy(tdf.Trajectory(jnp.asarray(run.expected)), field, reference, weights)
+    energy = trajectory_energy(tdf.Trajectory(jnp.asarray(run.expected)), field, reference, weights)
     np.testing.assert_allclose(run.expected_energy, energy, rtol=1e-4)
 
 
@@ -364,7 +365,7 @@ def test_rows_are_means_over_seeds():
 
 
 def test_tables_show_the_papers_numbers_beside_ours_and_every_variation():
-    plan = table.planned(TINY, 1, ("k = 0", "n = 3"))
+    plan = table.planned(dataclasses.replace(TINY, num_poses=3), 1, ("k = 0", "n = 3"))
     rows = table.rows(lambda setting: made((1.0, 0.001 * setting.num_poses)), plan)
     lines = table.as_markdown(rows).splitlines()
     assert sum(line.startswith(("| line", "| semicircle", "| wave")) for line in lines) == 9

@@ -84,21 +84,28 @@ def test_one_pose_has_waypoints_only():
 
 
 def test_a_clear_path_comes_back_as_it_is():
-    cleared = push_clear(LINE, BODY, [AWAY])
+    cleared = push_clear(LINE, BODY, [AWAY, AWAY])
     np.testing.assert_array_equal(cleared.trajectory.wxyz_xyz, LINE.wxyz_xyz)
     assert cleared.clear and cleared.deviation == 0 and cleared.status == "already clear: unchanged"
     assert cleared.clearance == pytest.approx(0.45, abs=1e-6)
 
 
 def test_a_box_across_a_line_is_passed_by_the_near_side():
+<<<<<<< ours
     assert clearance(LINE, BODY, [IN_THE_WAY]).min < -0.01
     cleared = push_clear(LINE, BODY, [IN_THE_WAY])
     assert_clear(cleared, LINE, [IN_THE_WAY])
+=======
+    scene = [AWAY, IN_THE_WAY]
+    assert clearance(LINE, BODY, scene).least < -0.01
+    cleared = push_clear(LINE, BODY, scene)
+    assert_clear(cleared, LINE, scene)
+>>>>>>> theirs
     # The box reaches 2 cm to the left and 4 cm to the right of the line, the cube 2 cm: 5 cm of shift are enough on the
     # left.
     assert 0.049 < cleared.deviation < 0.058
     assert np.asarray(cleared.trajectory.translations)[3, 0] < -0.045
-    again = push_clear(LINE, BODY, [IN_THE_WAY])
+    again = push_clear(LINE, BODY, scene)
     np.testing.assert_array_equal(again.trajectory.wxyz_xyz, cleared.trajectory.wxyz_xyz)
 
 

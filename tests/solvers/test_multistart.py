@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import carried, compilations, composed, random_cloud, random_poses
+from conftest import carried, compilations, composed, random_cloud, random_poses, trajectory_energy
 from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
@@ -50,7 +50,7 @@ def result(field, reference):
 
 def energy_of(trajectories, field, reference, weights=WEIGHTS):
     return np.array(
-        [tdf.trajectory_energy(tdf.Trajectory(wxyz_xyz), field, reference, weights) for wxyz_xyz in trajectories]
+        [trajectory_energy(tdf.Trajectory(wxyz_xyz), field, reference, weights) for wxyz_xyz in trajectories]
     )
 
 
@@ -83,7 +83,8 @@ def test_energies_and_gradients_are_those_of_the_energy(field, reference, pose_n
         prior = pose_energy(R[None], t[None], field.origin, dataclasses.replace(reference, trajectory=one), weights)
         return waypoint_loss(R, t, field, reference.query, reference.descriptors[index]) + prior
 
-    expected, gradient = jax.vmap(jax.value_and_grad(energy), (None, 0, 0, 0))(jnp.zeros(6), R, place, waypoint)
+    each = jax.jit(jax.vmap(jax.value_and_grad(energy), (None, 0, 0, 0)))
+    expected, gradient = each(jnp.zeros(6), R, place, waypoint)
     np.testing.assert_allclose(values[0], expected, rtol=1e-5)
     np.testing.assert_allclose(values[1], gradient, atol=1e-4 * np.abs(gradient).max())
 
@@ -96,12 +97,13 @@ def test_the_curvature_is_that_of_reweighted_squares(field, reference):
     )
     shown = problem.descriptors[:1, 0]
 
+    @jax.jit
     def residual(step):
         turned, centre = moved(R[0], place[0], step)
         return field.descriptors(problem.query[0] @ turned.T + centre) - shown[0]
 
     value, jacobian = (
-        np.asarray(part, np.float64) for part in (residual(jnp.zeros(6)), jax.jacfwd(residual)(jnp.zeros(6)))
+        np.asarray(part, np.float64) for part in (residual(jnp.zeros(6)), jax.jit(jax.jacfwd(residual))(jnp.zeros(6)))
     )
     size = np.abs(value)
     weights = 1 / np.maximum(size, size.mean(axis=-1, keepdims=True)) / value.size

@@ -7,16 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import composed, random_cloud, random_poses
+from conftest import CARRY, composed, random_cloud, random_poses, trajectory_energy
 from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 
 KEY = jax.random.key(0)
-CONFIG = tdf.CarryConfig(
-    num_starts=8, num_coarse_queries=3, coarse_steps=2, prune_steps=2, refine_steps=3, polish_steps=6, num_candidates=3
-)
+CONFIG = CARRY
 
 
 def motion_of(new, old):
@@ -101,7 +99,7 @@ def test_carrying_is_differentiable_where_nothing_turns(shown):
     def last(pick):
         return jnp.sum(tdf.carry_trajectory(shown, pick, shown.wxyz_xyz[-1]).wxyz_xyz[2, 4:])
 
-    assert np.isfinite(jax.grad(last)(shown.wxyz_xyz[0])).all()
+    assert np.isfinite(jax.jit(jax.grad(last))(shown.wxyz_xyz[0])).all()
 
 
 # ---- the pick ----
@@ -125,7 +123,7 @@ def test_picks_are_those_of_descriptors_alone(result, picked, field):
     alone, solved = picked
     np.testing.assert_allclose(result.trajectories[:, 0, 4:], solved.trajectories[:, 0, 4:], atol=1e-5)
     np.testing.assert_array_equal(result.energies, solved.energies)
-    energies = [tdf.descriptor_loss(tdf.Trajectory(one), field, alone) for one in solved.trajectories]
+    energies = [trajectory_energy(tdf.Trajectory(one), field, alone, tdf.EnergyWeights(0.0)) for one in solved.trajectories]
     np.testing.assert_allclose(result.energies, energies, rtol=1e-5)
     assert result.energies[0] < result.candidate_history[:, 0].max()
 

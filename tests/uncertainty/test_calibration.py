@@ -6,7 +6,7 @@ import warnings
 import jax
 import numpy as np
 import pytest
-from conftest import random_cloud
+from conftest import CARRY, random_cloud
 
 import tdf_jax as tdf
 from tdf_jax.evaluation.cases import QUERY_SIZE, generated_case, place_demonstration
@@ -66,20 +66,11 @@ def test_a_fit_recovers_the_curve_of_simulated_cases():
 def test_shipped_weights_judge_the_object_and_others_do_not(small_model, monkeypatch):
     cloud, other = (random_cloud(seed).astype(np.float32) for seed in (3, 4))
     demonstration = tdf.Demonstration(cloud, tdf.line(num_poses=2), tdf.box_query(KEY, 8))
-    config = tdf.CarryConfig(
-        num_starts=2,
-        num_candidates=1,
-        num_coarse_queries=4,
-        coarse_steps=1,
-        prune_steps=1,
-        refine_steps=1,
-        polish_steps=1,
-    )
 
     def imitated(name, curve):
         monkeypatch.setattr("tdf_jax.imitation.CURVES", {"mug": curve})
         model = dataclasses.replace(small_model, info=dataclasses.replace(small_model.info, name=name))
-        return model, tdf.imitate(model, demonstration, other, key=KEY, config=config)
+        return model, tdf.imitate(model, demonstration, other, key=KEY, config=CARRY)
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
