@@ -123,7 +123,9 @@ def test_picks_are_those_of_descriptors_alone(result, picked, field):
     alone, solved = picked
     np.testing.assert_allclose(result.trajectories[:, 0, 4:], solved.trajectories[:, 0, 4:], atol=1e-5)
     np.testing.assert_array_equal(result.energies, solved.energies)
-    energies = [trajectory_energy(tdf.Trajectory(one), field, alone, tdf.EnergyWeights(0.0)) for one in solved.trajectories]
+    energies = [
+        trajectory_energy(tdf.Trajectory(one), field, alone, tdf.EnergyWeights(0.0)) for one in solved.trajectories
+    ]
     np.testing.assert_allclose(result.energies, energies, rtol=1e-5)
     assert result.energies[0] < result.candidate_history[:, 0].max()
 
