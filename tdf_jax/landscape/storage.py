@@ -19,7 +19,8 @@ REDUCTIONS = ("min", "softmin", "assigned", "mean")
 # Choices of the release before; they are accepted for one release, with a DeprecationWarning.
 DEPRECATED_REDUCTIONS = {"least": "min", "soft_least": "softmin"}
 TEMPERATURE = 5e-4  # of the softmin; the energy of a waypoint is about 0.002 at a match and 0.01 far away
-FORMAT = 1  # of files; raised if a field is removed or its meaning changes
+FORMAT = 2  # of files; raised if a field is removed or its meaning changes
+READABLE_FORMATS = (1, 2)  # files of format 1 have the former names of the reductions
 FRAME = "world"
 
 
@@ -182,9 +183,10 @@ def load_landscape(path: str | os.PathLike) -> tuple[Landscape, dict]:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         header = json.loads(str(arrays.pop("header")))
-        if header["format"] != FORMAT:
+        if header["format"] not in READABLE_FORMATS:
             raise InputError(
-                f"load_landscape(): {path} has format {header['format']}; expected {FORMAT}: compute it again"
+                f"load_landscape(): {path} has format {header['format']}; expected one of {READABLE_FORMATS}: "
+                "compute it again"
             )
         axes = tuple(arrays[f"coordinates_{axis}"] for axis in range(len(arrays["directions"])))
         grid = Grid(arrays["origin"], arrays["directions"], axes, arrays.get("mask"))
