@@ -1,4 +1,4 @@
-"""The house: which package may import which, how modules are named, and that heavy libraries load only when they are used."""
+"""Layout: which package may import which, how modules are named, and that heavy libraries load only when used."""
 
 import ast
 import inspect

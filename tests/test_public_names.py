@@ -1,4 +1,4 @@
-"""Every public name and its signature, against the list in public_names.txt: a change of the interface is a change of that file.
+"""Every public name and its signature, against the list in public_names.txt.
 
 `python tests/test_public_names.py` writes the file anew.
 """

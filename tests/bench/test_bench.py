@@ -1,4 +1,7 @@
-"""The benchmark: its peer is the original network and agrees with tdf_jax, and its machinery measures, reports and gates. No times are asserted."""
+"""The benchmark: its peer is the original network and agrees with tdf_jax; its machinery measures, reports and gates.
+
+No times are asserted.
+"""
 
 import json
 
@@ -227,7 +230,8 @@ def test_ratios_are_of_every_peer_and_each_of_ours():
     times = {"torch": 6.0, "torch_tuned": 3.0, "tdf_jax": 2.0, "tdf_jax_solve": 1.0}
     found = ratios({name: {"seconds": {"median": seconds}} for name, seconds in times.items()})
     assert found == {
-        "torch / tdf_jax": 3.0, "torch_tuned / tdf_jax": 1.5, "torch / tdf_jax_solve": 6.0, "torch_tuned / tdf_jax_solve": 3.0
+        "torch / tdf_jax": 3.0, "torch_tuned / tdf_jax": 1.5,
+        "torch / tdf_jax_solve": 6.0, "torch_tuned / tdf_jax_solve": 3.0
     }  # fmt: skip
 
 

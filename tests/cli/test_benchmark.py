@@ -502,8 +502,10 @@ def test_several_demonstrations_are_drawn_for_every_way_from_the_first_on():
         return {"clouds": clouds, "count": count, "way": way, "distances": list(errors), "angles": [5.0, 5.0, 11.0]}
 
     found = [
-        row("full", 1, "mean", 0.001, 0.02, 0.005), row("full", 3, "mean", 0.001, 0.01, 0.005), row("full", 3, "median", 0.02, 0.03, 0.001),
-        row("noise", 1, "mean", 0.04, 0.03, 0.02), row("noise", 3, "mean", 0.001, 0.02, 0.02), row("noise", 3, "median", 0.001, 0.009, 0.002),
+        row("full", 1, "mean", 0.001, 0.02, 0.005), row("full", 3, "mean", 0.001, 0.01, 0.005),
+        row("full", 3, "median", 0.02, 0.03, 0.001),
+        row("noise", 1, "mean", 0.04, 0.03, 0.02), row("noise", 3, "mean", 0.001, 0.02, 0.02),
+        row("noise", 3, "median", 0.001, 0.009, 0.002),
     ]  # fmt: skip
     success, errors = demonstrations_figure(found).axes
     expected = {

@@ -129,8 +129,10 @@ def test_the_record_tells_all_settings(folder, weights):
     record = record_of(folder)
     assert (record["schema"], record["tdf_jax"], record["seed"]) == (report.SCHEMA, tdf.__version__, 0)
     assert record["settings"] == {
-        "target": None, "scale": 1.0, "target_pose": "random", "demonstration": None, "category": "mug", "trajectory": "wave",
-        "goal_offset": [0.0, 0.0, 0.0], "k": None, "method": "adam", "num_starts": 3, "num_poses": 4, "queries": 8, "iterations": 3, "points": 60,
+        "target": None, "scale": 1.0, "target_pose": "random", "demonstration": None, "category": "mug",
+        "trajectory": "wave",
+        "goal_offset": [0.0, 0.0, 0.0], "k": None, "method": "adam", "num_starts": 3, "num_poses": 4, "queries": 8,
+        "iterations": 3, "points": 60,
         "seed": 0, "weights": str(weights), "out": str(folder), "no_plots": False, "json": False,
     }  # fmt: skip
     assert record["energy"] == dataclasses.asdict(tdf.EnergyWeights(0.02))
@@ -623,8 +625,8 @@ def test_a_model_card_tells_what_the_record_does(evaluation):
     assert lines[0] == "# small" and "| trained by | a test |" in lines
     assert "Generated mugs: 2 that no training run saw, 2 transfers of the handle." in lines
     assert (
-        "`tdf evaluate --seed 3 --pairs 2 --num-starts 2 --iterations 2 --meshes DIR --num-poses 2 --category mug --clouds full views1 half`"
-        in card
+        "`tdf evaluate --seed 3 --pairs 2 --num-starts 2 --iterations 2 --meshes DIR --num-poses 2 --category mug "
+        "--clouds full views1 half`" in card
     )
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.count("|") == 11]
     rows = [row for row in rows if row[0] not in ("cloud", "---")]

@@ -1,4 +1,4 @@
-"""Real meshes: places measured on generated mugs, bowls and bottles, whose frames are known, and sidecars that must be refused."""
+"""Real meshes: places measured on generated objects whose frames are known, and sidecars that must be refused."""
 
 import json
 import re

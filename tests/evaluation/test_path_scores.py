@@ -86,7 +86,7 @@ def assert_same_poses(found, expected, metres=1e-5, degrees=0.05):
 
 
 def carried_by_hand(shown, pick, goal):
-    """Both ends' motions, the turn by scipy's slerp between them and the places on the line between where both carry them."""
+    """Motions of both ends, rotations by scipy's slerp between them, and translations on the line between both."""
     A, G = (matrix(end) @ np.linalg.inv(matrix(one)) for end, one in ((pick, shown[0]), (goal, shown[-1])))
     s = np.linspace(0, 1, len(shown))
     between = Slerp([0, 1], Rotation.from_matrix([A[:3, :3], G[:3, :3]]))(s)
@@ -115,7 +115,7 @@ def test_24_tasks_are_every_path_with_every_goal_and_six_are_every_path(case):
 
 
 def test_a_demonstration_has_the_path_it_is_called_after(case):
-    """Known properties: a line is straight, a semicircle half as high as long, poured is turned by 90 degrees, a lift goes 15 cm up."""
+    """A line is straight, a semicircle half as high as long; pouring rotates by 90 degrees, a lift goes 15 cm up."""
     tasks = {task.path: task for task in (make_task(case, 0, index) for index in range(6))}
     place = np.linalg.norm([0.0, 0.24, 0.18])
     for task in tasks.values():
@@ -773,7 +773,8 @@ def test_errors_are_summarised_by_hand(many):
         assert 0 < right < best
     for name, of, factor in (
         ("oracle_path_median_cm", "best_path", 100), ("frechet_median_cm", "frechet", 100), ("jerk_median", "jerk", 1),
-        ("longest_step_median", "longest_step", 1), ("expected_step_median", "expected_step", 1), ("seconds_median", "seconds", 1),
+        ("longest_step_median", "longest_step", 1), ("expected_step_median", "expected_step", 1),
+        ("seconds_median", "seconds", 1),
     ):  # fmt: skip
         assert row[name] == pytest.approx(factor * np.quantile([getattr(one, of) for one in ours], 0.5))
     assert row["penetration_mean"] == pytest.approx(
@@ -1083,7 +1084,8 @@ def test_a_damaged_file_is_named(task, model, tmp_path, damage):
     outcomes([lambda: task], model, tmp_path, ("copy",))
     (path,) = tmp_path.iterdir()
     path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(InputError, match=f"{re.escape(str(path))} cannot be read .*delete it, and it is computed again"):
+    message = f"{re.escape(str(path))} cannot be read .*delete it, and it is computed again"
+    with pytest.raises(InputError, match=message):
         outcomes([lambda: task], model, tmp_path, ("copy",))
     path.unlink()
     assert len(outcomes([lambda: task], model, tmp_path, ("copy",))) == 1
@@ -1310,8 +1312,8 @@ def test_the_worst_failures_are_listed_by_their_turn(many, text):
     known = sum(one.best_pick[0] <= 0.02 and one.best_pick[1] <= 20 for one in failed)
     assert len(failed) > LISTED and 0 < known < len(failed)
     assert (
-        f"Of 60 picks of `tdf_jax`, {len(failed)} are off by more than 2 cm or 20°; for {known} of them, another candidate is within both bounds."
-        in text
+        f"Of 60 picks of `tdf_jax`, {len(failed)} are off by more than 2 cm or 20°; "
+        f"for {known} of them, another candidate is within both bounds." in text
     )
     rows = tables(text)[4][2:]
     assert len(rows) == LISTED
@@ -1379,8 +1381,8 @@ def test_clouds_have_tables_of_their_own(many, model):
 
 def test_the_page_tells_how_it_was_made(text):
     assert (
-        "`tdf benchmark --weights small --pairs 60 --seed 0 --height 0.12 --clouds full --num-starts 2`: 20 objects, weights `small`, 2 starts"
-        in text
+        "`tdf benchmark --weights small --pairs 60 --seed 0 --height 0.12 --clouds full --num-starts 2`: "
+        "20 objects, weights `small`, 2 starts" in text
     )
     assert "{" not in text and "trajectory of 7 poses" in text
 

@@ -229,7 +229,8 @@ def test_a_start_that_becomes_non_finite_is_reported_and_the_others_are_unaffect
         lost = run(field, reference, starts=result.initial_trajectories.at[:, 0, 4].set(1e30))
         with pytest.raises(
             InputError,
-            match="3 of 3 starts became non-finite: 0, 1, 2; check the weights and the query points, or, with Adam, lower rotation_rate and translation_rate",
+            match="3 of 3 starts became non-finite: 0, 1, 2; check the weights and the query points, or, with Adam, "
+            "lower rotation_rate and translation_rate",
         ):
             _ = lost.trajectory
 

@@ -27,16 +27,22 @@ path = tdf.wave(4, start=(0, 0, 0), end=(0, 0.2, 0))
 reference = tdf.describe(model, tdf.Demonstration(cloud, path, tdf.box_query(jax.random.key(1), 20, 0.06)))
 field = tdf.encode(model, cloud + 0.01)
 calls = []
-for config, rows in ((tdf.OptimizeConfig(num_starts=11, iterations=5), 11), (tdf.SolveConfig(num_starts=13, num_trajectory_starts=3, num_coarse_queries=8, coarse_steps=3, prune_steps=3, search_steps=3, propagate_steps=2, refine_steps=2, polish_steps=3), 2)):
+stages = {f'{stage}_steps': count for stage, count in zip(
+    ('coarse', 'prune', 'search', 'propagate', 'refine', 'polish'), (3, 3, 3, 2, 2, 3)
+)}
+solver = tdf.SolveConfig(num_starts=13, num_trajectory_starts=3, num_coarse_queries=8, **stages)
+for config, rows in ((tdf.OptimizeConfig(num_starts=11, iterations=5), 11), (solver, 2)):
     minimise = tdf.optimize if isinstance(config, tdf.OptimizeConfig) else tdf.solve
     one = minimise(field, reference, jax.random.key(2), config=config)
     mesh = jax.make_mesh((4, 2), ('hosts', 'starts')) if several else jax.make_mesh((8,), ('starts',))
     many = minimise(
-        field, reference, jax.random.key(2), config=config, device_mesh=mesh, progress=lambda done, energies: calls.append(energies.shape)
+        field, reference, jax.random.key(2), config=config, device_mesh=mesh,
+        progress=lambda done, energies: calls.append(energies.shape)
     )
     assert many.trajectories.shape == (rows, 4, 7)
     for name in ('trajectories', 'energies', 'candidate_history', 'initial_trajectories', 'history'):
-        np.testing.assert_allclose(getattr(many, name), getattr(one, name), rtol=1e-5, atol=1e-5, err_msg=f'{minimise.__name__} {name}')
+        message = f'{minimise.__name__} {name}'
+        np.testing.assert_allclose(getattr(many, name), getattr(one, name), rtol=1e-5, atol=1e-5, err_msg=message)
 assert calls == [(11,)] + [(2,)] * 6
 
 shared_lattice.NODES, used, kept = 60, set(), shared_lattice._tile

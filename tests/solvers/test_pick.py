@@ -38,7 +38,7 @@ def ends():
 
 
 def test_each_waypoint_is_moved_by_what_lies_between_the_motions_of_the_ends(shown, ends):
-    """By scipy: rotations on the geodesic from the pick's motion to the goal's, places on the line between where both would carry them."""
+    """By scipy: rotations on the geodesic between both motions, translations on the line between their results."""
     found = tdf.carry_trajectory(shown, *ends)
     (turn_a, move_a), (turn_g, move_g) = motion_of(ends[0], shown.wxyz_xyz[0]), motion_of(ends[1], shown.wxyz_xyz[-1])
     between = (turn_a.inv() * turn_g).as_rotvec()
