@@ -59,7 +59,7 @@ def test_every_picture_and_page_is_linked():
 
 
 COMMAND = re.compile(r"\btdf (\w+)((?: [^`\n#]*)?)")
-WRITTEN = [page for page in PAGES if page.parent.name not in {"weights", "notebooks", "benchmark", "benchmark_views1"}]
+WRITTEN = [page for page in PAGES if page.parent.name not in {"notebooks"}]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
