@@ -194,12 +194,9 @@ __all__ = [
 
 def __getattr__(name: str):
     if name == "poses":  # the module's name in the release before
-        import warnings
-
+        from tdf_jax._internal.deprecation import warn
         from tdf_jax.geometry import se3
 
-        warnings.warn(
-            "tdf_jax.poses is deprecated; use tdf_jax.turns and tdf_jax.rotation_grid", DeprecationWarning, stacklevel=2
-        )
+        warn("tdf_jax.poses", "tdf_jax.turns and tdf_jax.rotation_grid")
         return se3
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from tdf_jax._internal import checks
-from tdf_jax._internal.deprecation import renamed_keywords
+from tdf_jax._internal.deprecation import caller_level, renamed_keywords
 from tdf_jax._internal.errors import CategoryWarning, InputError
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference, describe
@@ -110,7 +110,7 @@ def _judged(result: Result, weights: str, field, points) -> Result:
             "imitate(): the object does not look like one of the demonstration's category to the weights "
             f"{weights!r} (probability {recognised:.2g}); check the target, its unit and the weights",
             CategoryWarning,
-            stacklevel=4,  # the caller of `imitate`, whose decorator is one frame
+            stacklevel=caller_level(),
         )
     known = {"recognised": recognised, "confidence": confident}
     # In numpy, because under `jax_debug_nans` an array of jax must not hold NaN.
@@ -119,6 +119,7 @@ def _judged(result: Result, weights: str, field, points) -> Result:
     )
 
 
+@renamed_keywords(mesh="device_mesh")
 def imitate_batch(
     model: Model,
     demonstration: Demonstration | Sequence[Demonstration] | Reference,

@@ -2,14 +2,36 @@
 
 import dataclasses
 import functools
+import os
+import sys
 import warnings
+from pathlib import Path
 
 from tdf_jax._internal.errors import InputError
 
+# Frames of these files are not the caller's: the package itself, and what calls constructors on a caller's behalf.
+_LIBRARY = (f"{Path(__file__).parents[1]}{os.sep}", dataclasses.__file__)
 
-def warn(old: str, new: str, stacklevel: int = 3) -> None:
-    """Warn that a name goes; `stacklevel` as for `warnings.warn`, counted from the function that calls this one."""
-    warnings.warn(f"{old} is deprecated; use {new}", DeprecationWarning, stacklevel=stacklevel)
+
+def caller_level() -> int:
+    """`stacklevel` for a `warnings.warn` of the calling function that points to the first frame outside the library.
+
+    Python shows a DeprecationWarning by default only where it points to a user's own code.
+    """
+    level, frame = 1, sys._getframe(1)
+    while frame.f_back is not None and _is_ours(frame.f_code):
+        level, frame = level + 1, frame.f_back
+    return level
+
+
+def _is_ours(code) -> bool:
+    generated = code.co_filename == "<string>" and code.co_name == "__init__"  # by `dataclasses.dataclass`
+    return generated or code.co_filename.startswith(_LIBRARY)
+
+
+def warn(old: str, new: str) -> None:
+    """Warn that a name is deprecated, at the line of the user's code that has it."""
+    warnings.warn(f"{old} is deprecated; use {new}", DeprecationWarning, stacklevel=caller_level())
 
 
 def renamed_keywords(**new_names: str):

@@ -66,7 +66,7 @@ def energy_landscape(
             field are from different networks.
     """
     # The level of the caller counts the decorator.
-    reduce = check_reduction("energy_landscape()", reduce, stacklevel=5)
+    reduce = check_reduction("energy_landscape()", reduce)
     landscape = blank(field, reference, grid, rotation, reduce, over_rotations=over_rotations, temperature=temperature)
     for done, total in fill(landscape, field, reference, share=share, device_mesh=device_mesh):
         if progress is not None:

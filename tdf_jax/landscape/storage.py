@@ -52,7 +52,7 @@ class Landscape:
 
     def __post_init__(self):
         # The level of the caller counts the constructor that the dataclass generates.
-        object.__setattr__(self, "reduce", check_reduction("Landscape()", self.reduce, stacklevel=5))
+        object.__setattr__(self, "reduce", check_reduction("Landscape()", self.reduce))
         checks.positive("Landscape()", "temperature", self.temperature, unit="an energy")
         shape = (len(self.waypoints), *self.grid.shape)
         each = (len(self.waypoints), len(self.rotations), *self.grid.shape)
@@ -113,13 +113,12 @@ class Landscape:
         return np.divmod(np.nanargmin(flat, axis=1), int(np.prod(self.grid.shape)))
 
 
-def check_reduction(function: str, reduce: str, stacklevel: int) -> str:
+def check_reduction(function: str, reduce: str) -> str:
     """Check how waypoints are reduced, and replace a deprecated choice.
 
     Args:
         function: name that the error message begins with.
         reduce: one of `REDUCTIONS`, or a choice of the release before.
-        stacklevel: level of the caller who chose it, as for `warnings.warn` called in `tdf_jax._internal.deprecation`.
 
     Returns:
         One of `REDUCTIONS`.
@@ -128,7 +127,7 @@ def check_reduction(function: str, reduce: str, stacklevel: int) -> str:
         InputError: the choice is unknown.
     """
     if isinstance(reduce, str) and reduce in DEPRECATED_REDUCTIONS:
-        warn(f"{function[:-1]}reduce={reduce!r})", f"reduce={DEPRECATED_REDUCTIONS[reduce]!r}", stacklevel)
+        warn(f"{function[:-1]}reduce={reduce!r})", f"reduce={DEPRECATED_REDUCTIONS[reduce]!r}")
         return DEPRECATED_REDUCTIONS[reduce]
     return checks.choice(function, "reduce", reduce, REDUCTIONS)
 

@@ -1,5 +1,6 @@
 """Names of the release before: accepted with a warning, and equal in what they do."""
 
+import contextlib
 import dataclasses
 import json
 
@@ -135,6 +136,24 @@ def test_the_module_of_poses_is_still_there():
         assert tdf.poses is se3
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
         _ = tdf.nothing
+
+
+def test_warnings_point_to_the_callers_line(small_model, demonstration):
+    """There, and not in the library's files, Python shows them by default."""
+    cloud = demonstration.points
+    calls = (
+        lambda: tdf.line(poses=4),
+        lambda: tdf.CarryConfig(scouts=3),
+        lambda: tdf.line(5).poses,
+        lambda: dataclasses.replace(tdf.OptimizeConfig(), inits=2),
+        lambda: tdf.poses,
+        lambda: tdf.imitate(small_model, demonstration, cloud, key=jax.random.key(0), mesh=3),
+        lambda: tdf.imitate_batch(small_model, demonstration, [cloud], key=jax.random.key(0), mesh=3),
+    )
+    for call in calls:
+        with pytest.warns(DeprecationWarning) as warned, contextlib.suppress(InputError):
+            call()
+        assert [one.filename for one in warned] == [__file__]
 
 
 def test_replace_takes_former_names_too():
