@@ -17,15 +17,14 @@ from tdf_jax.networks.model import Model
 from tdf_jax.paper import setting as settings
 from tdf_jax.paper.setting import SHAPES, Setting
 
-REDUCTIONS = {"least": "min", "mean": "mean"}  # `Landscape.reduce` for each choice of `Setting.field_energy`
 HALF = 1.2  # half of the edge of the square, in the paper's unit
 # Degrees about z by which a mug is rotated if `Setting.turn` is no number. Its true path then stays in the plane.
 UPRIGHT_TURN = 60.0
 FIELDS = {  # the object in the field: number of the mug, and whether it is rotated
     "reference mug": (0, False),
     "test mug": (1, False),
-    "reference mug, turned": (0, True),
-    "test mug, turned": (1, True),
+    "reference mug, rotated": (0, True),
+    "test mug, rotated": (1, True),
 }
 
 
@@ -89,7 +88,7 @@ def figure2(model: Model, base: Setting, field: str, count: int = 101) -> dict[s
     panels = {}
     for name, part in zip(SHAPES, np.split(np.arange(len(swept.values)), len(SHAPES))):
         fields = {field: getattr(swept, field)[part] for field in ("values", "waypoints", "turned")}
-        landscape = dataclasses.replace(swept, **fields, reduce=REDUCTIONS[base.field_energy])
+        landscape = dataclasses.replace(swept, **fields, reduce=base.field_energy)
         panels[name] = Swept(
             *(steps / base.unit for steps in swept.grid.coordinates),
             energies=landscape.combined,

@@ -53,7 +53,7 @@ VARIATIONS: dict[str, dict] = {
     "query: Gaussian, sigma 2.5 cm": {"query": "gaussian"},
     "query: box of 5 cm": {"query_size": 0.05},
     "query: box of 20 cm": {"query_size": 0.2},
-    "start: the whole path turned": {"start": "carried"},
+    "start: the whole path rotated": {"start": "carried"},
     "translation rate 0.01 m": {"translation_rate": 0.01},
     "10 starts": {"num_starts": 10},
     "objects of 0.2 m": {"diagonal": 0.2},

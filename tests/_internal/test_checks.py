@@ -17,7 +17,7 @@ def test_keys_of_both_kinds_pass(key):
 
 
 @pytest.mark.parametrize("key", [0, None, 1.5, np.zeros(2), np.uint32(3), jax.random.split(jax.random.key(0))])
-def test_anything_else_is_told_how_to_make_one(key):
+def test_anything_else_raises_with_the_remedy(key):
     with pytest.raises(InputError, match=r"f\(\): key is .*; expected one random key, such as jax.random.key\(0\)"):
         checks.key("f()", key)
 

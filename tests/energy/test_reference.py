@@ -67,7 +67,7 @@ def test_an_unknown_combination_is_refused(small_model, demonstration):
         tdf.describe(small_model, demonstration, combine="best")
 
 
-def test_clouds_are_thinned_to_the_networks_density(small_model, demonstration, reference):
+def test_clouds_are_subsampled_to_the_networks_density(small_model, demonstration, reference):
     dense = np.concatenate([random_cloud(0), random_cloud(0) + 1e-3]).astype(np.float32)
     assert thin(dense, 40).shape == (40, 3)
     model = dataclasses.replace(small_model, info=tdf.ModelInfo("small", "random numbers", cloud_points=40))

@@ -64,7 +64,7 @@ def in_file(mesh, up, front, unit):
     return mesh.copy().apply_transform(T_file_object).apply_scale(1 / unit)
 
 
-def turned(mesh, degrees, axis=(0, 0, 1)):
+def rotated(mesh, degrees, axis=(0, 0, 1)):
     return mesh.copy().apply_transform(trimesh.transformations.rotation_matrix(np.radians(degrees), axis))
 
 
@@ -119,7 +119,7 @@ def test_a_handle_above_the_rim_does_not_raise_the_body(mugs):
 
 
 @pytest.mark.parametrize(("up", "handle"), [("+z", "-x"), ("+z", "+y"), ("+x", "+z"), ("-z", "+x"), ("+y", "+x")])
-def test_wrong_axes_of_a_mesh_are_noticed(folder, up, handle):
+def test_wrong_axes_of_a_mesh_are_reported(folder, up, handle):
     where = folder({"mug.obj": build_mug().mesh}, {"mug.obj": ENTRY | {"up": up, "handle": handle}})
     with pytest.raises(InputError, match="mug.obj.*'up'"):
         load_annotated(where)
@@ -166,7 +166,7 @@ def test_scans_are_measured_like_clean_meshes(sampled, category):
         holes = trimesh.Trimesh(mesh.vertices, mesh.faces[rng.random(len(mesh.faces)) > 0.1], process=False)
         assert not holes.is_watertight
         noisy = moved_vertices(mesh, mesh.vertices + 3e-4 * rng.normal(size=mesh.vertices.shape))
-        for scan, most in ((holes, 1e-3), (noisy, 3e-3), (turned(mesh, 1.0, (1, 0.3, 0)), 5e-3)):
+        for scan, most in ((holes, 1e-3), (noisy, 3e-3), (rotated(mesh, 1.0, (1, 0.3, 0)), 5e-3)):
             found, others = places_of(scan, shape)
             for name, T in others.items():
                 assert np.linalg.norm(found.origin + T[:3, 3] - clean.origin - places[name][:3, 3]) < most, name
@@ -221,19 +221,19 @@ def test_a_pouring_lip_does_not_move_the_axis_of_a_bowl():
 @pytest.mark.parametrize(
     ("category", "symmetry"), [("bowl", "two-fold"), ("bottle", "two-fold"), ("bottle", "four-fold")]
 )
-def test_a_turned_side_is_measured(category, symmetry, angle):
+def test_a_rotated_side_is_measured(category, symmetry, angle):
     shape = DEFAULTS[category][symmetry]()
-    found = profile(turned(shape.mesh, angle), category, shape.fold, category)
+    found = profile(rotated(shape.mesh, angle), category, shape.fold, category)
     assert np.degrees(found.turned) == pytest.approx(angle, abs=1.0)
 
 
 @pytest.mark.parametrize("turn", [((1, 0, 0), 180), ((0, 1, 0), 90), ((0, 1, 0), -90), ((1, 0, 0), 90)])
 @pytest.mark.parametrize("category", ["bowl", "bottle"])
-def test_a_bowl_or_bottle_that_does_not_stand_is_noticed(sampled, category, turn):
+def test_a_bowl_or_bottle_that_does_not_stand_is_reported(sampled, category, turn):
     axis, degrees = turn
     for shape in sampled[category][2:6]:
         with pytest.raises(InputError, match="'up'"):
-            places_of(turned(shape.mesh, degrees, axis), shape)
+            places_of(rotated(shape.mesh, degrees, axis), shape)
 
 
 # Sidecars
@@ -299,7 +299,7 @@ def test_round_objects_need_no_front(folder, up):
 
 def test_a_front_may_be_a_direction_and_must_be_that_of_the_longer_side(folder):
     bottle = build_bottle(FLAT)
-    meshes = {"my.obj": turned(bottle.mesh, -23.0)}
+    meshes = {"my.obj": rotated(bottle.mesh, -23.0)}
     with pytest.raises(
         InputError, match=r'my.obj has its longer side 23 degrees from \'front\'; .*"front": \[0.92., -0.39., 0.000\]'
     ) as refused:
@@ -311,7 +311,7 @@ def test_a_front_may_be_a_direction_and_must_be_that_of_the_longer_side(folder):
     with pytest.raises(InputError, match=r"my.obj has its flat side 23 degrees"):
         load_annotated(
             folder(
-                {"my.obj": turned(DEFAULTS["bottle"]["four-fold"]().mesh, 23.0)},
+                {"my.obj": rotated(DEFAULTS["bottle"]["four-fold"]().mesh, 23.0)},
                 {"my.obj": BOTTLE | {"symmetry": "four-fold"}},
             )
         )
@@ -330,7 +330,7 @@ def test_a_front_may_be_a_direction_and_must_be_that_of_the_longer_side(folder):
         ),
     ],
 )
-def test_another_symmetry_than_the_mesh_has_is_noticed(folder, symmetry, mesh, message):
+def test_another_symmetry_than_the_mesh_has_is_reported(folder, symmetry, mesh, message):
     entry = BOTTLE | {"symmetry": symmetry, "front": "+y" if symmetry == "none" else "+x"}
     with pytest.raises(InputError, match=message):
         load_annotated(folder({"my.obj": build_bottle(mesh).mesh}, {"my.obj": entry}))
@@ -473,7 +473,7 @@ def test_a_handle_that_is_given_need_not_be_measurable(folder, grip, message):
     np.testing.assert_allclose(found.frames["rim"], mug.rim_frame, atol=1e-3)
 
 
-def test_names_are_told_apart(folder):
+def test_names_are_distinguished(folder):
     with pytest.raises(InputError, match="several meshes called mug"):
         load_annotated(
             folder({"mug.obj": build_mug().mesh, "mug.stl": build_mug().mesh}, {"mug.obj": ENTRY, "mug.stl": ENTRY})

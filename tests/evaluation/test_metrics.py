@@ -48,10 +48,10 @@ def test_jerk_and_steps():
     assert longest_step(np.zeros((4, 3))) == 1.0
 
 
-def test_penetration_counts_query_points_in_the_clay():
+def test_penetration_counts_query_points_in_the_solid():
     mug, T_world_mug = tdf.build_mug(), random_pose(0, 0)
     rng = np.random.default_rng(0)
-    # Points of the mug's own frame, half of them in the clay, as the query of a pose that is the mug's.
+    # Points of the mug's own frame, half of them in the solid, as the query of a pose that is the mug's.
     points = rng.uniform(*mug.mesh.bounds, (20000, 3))
     inside = mug.contains(points)
     chosen = np.concatenate([points[inside][:50], points[~inside][:50]])

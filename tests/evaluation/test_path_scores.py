@@ -274,7 +274,7 @@ def test_every_attempt_is_finite_and_ends_at_the_goal(attempts, task, method):
     )
 
 
-def test_only_the_library_tells_a_residual(attempts, encoded):
+def test_only_the_library_has_a_residual(attempts, encoded):
     descriptors = np.asarray(encoded[1].descriptors[0], float)
     spread = np.abs(descriptors - descriptors.mean(axis=0)).mean()
     assert attempts["tdf_jax"].residual == pytest.approx(attempts["tdf_jax"].scores.min() / spread, rel=1e-4)
@@ -378,7 +378,7 @@ def test_attempts_do_not_depend_on_the_others_nor_on_their_order(attempts, task,
         np.testing.assert_array_equal(found.scores, attempts[name].scores)
 
 
-def test_starts_are_drawn_anew_for_every_task_and_key(attempts, task, model):
+def test_starts_are_drawn_for_every_task_and_key(attempts, task, model):
     for key, index in ((jax.random.key(6), task.index), (KEY, task.index + 1)):
         for name in ("ICP", "NDF pick, carried"):
             found = Attempts(dataclasses.replace(task, index=index), model, key, INITS).of(name)
@@ -560,7 +560,7 @@ def perfect(task):
 
 
 def displaced(trajectory, move=(0, 0, 0), degrees=0.0):
-    """Every pose moved in the world and turned about its own x axis."""
+    """Every pose translated in the world and rotated about its own x axis."""
     found = np.array(trajectory, np.float64)
     found[:, 4:] += move
     turned = Rotation.from_quat(found[:, :4], scalar_first=True) * Rotation.from_rotvec([np.radians(degrees), 0, 0])
@@ -592,7 +592,7 @@ def test_known_errors_are_measured_in_metres_and_degrees(task):
     assert found.confidence is None
 
 
-def test_the_goal_is_left_out_of_the_path_error(task):
+def test_the_path_error_excludes_the_goal(task):
     path = perfect(task)[0].copy()
     path[-1, 4:] += [0.7, 0, 0]
     path[2, 4:] += [0, 0, 0.06]
@@ -615,8 +615,8 @@ def test_a_path_is_measured_against_the_true_one_by_hand(task):
     assert found.longest_step == pytest.approx(steps.max() / steps.mean()) and found.longest_step > found.expected_step
 
 
-def test_clay_on_the_true_path_does_not_count_as_penetration(task):
-    """Far away, no query point is in the clay: the share that the truth has there, negative."""
+def test_solid_on_the_true_path_does_not_count_as_penetration(task):
+    """Far away, no query point is in the solid: the share that the truth has there, negative."""
     away = perfect(task)[0].copy()
     away[:, 4:] += 5.0
     found = score("PCA", Attempt(away[None], np.zeros(1), 0.0), task)
@@ -643,7 +643,7 @@ def test_open_meshes_have_no_penetration_wherever_a_path_is(task, metres):
 
 
 def several(task):
-    """Starts by rising score: 4 cm off all along; a good path with a turned pick; a good pick on a bad path."""
+    """Starts by rising score: 4 cm off all along; a good path with a rotated pick; a good pick on a bad path."""
     good = perfect(task)[0]
     turned, strayed = displaced(good), displaced(good)
     turned[0] = displaced(good[:1], (0, 0, 0.001), 40)[0]
@@ -653,7 +653,7 @@ def several(task):
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (1, 2, 0)])
-def test_the_chosen_start_has_the_least_score_and_the_best_are_told_apart(task, order):
+def test_the_chosen_start_has_the_least_score_and_the_best_are_distinguished(task, order):
     order = np.array(order)
     found = score("ICP", Attempt(several(task)[order], np.array([1.0, 2.0, 3.0])[order], 0.0), task)
     assert found.starts == 3
@@ -683,7 +683,7 @@ def test_a_start_that_became_non_finite_spoils_nothing(task):
     assert found == dataclasses.replace(
         score("TDF, l_p", Attempt(paths[1:], np.array([1.0, 2.0, 3.0]), 0.0), task), starts=4
     )
-    # a task that is lost altogether is a failure that can be told
+    # a task that is lost altogether is a failure that can be reported
     json.dumps(dataclasses.asdict(lost), allow_nan=False)
     assert not lost.succeeds(THRESHOLDS["5cm_30deg"])
 
@@ -1091,7 +1091,7 @@ def test_a_damaged_file_is_named(task, model, tmp_path, damage):
     assert len(outcomes([lambda: task], model, tmp_path, ("copy",))) == 1
 
 
-def test_an_unknown_method_is_told_before_anything_runs(model, tmp_path):
+def test_an_unknown_method_raises_before_anything_runs(model, tmp_path):
     with pytest.raises(InputError, match=r"run\(\): methods has 'RANSAC'; expected some of copy, centroids, .*tdf_jax"):
         next(run([lambda: pytest.fail("made a task")], model, ("copy", "RANSAC"), tmp_path))
 
@@ -1197,11 +1197,11 @@ def test_picks_are_learnt_on_every_fifth_task(tasks, case, model, tmp_path, show
     assert one.distances == asked(tasks[:2], model, tmp_path, (1,))[0].distances and len(shown) == 2
 
 
-def test_no_number_asks_for_nothing(model, tmp_path):
+def test_no_number_computes_nothing(model, tmp_path):
     assert count_errors([lambda: pytest.fail("made a task")], model, (), tmp_path, progress=False) == []
 
 
-def test_a_number_asked_for_twice_counts_once(tasks, model, tmp_path, shown):
+def test_a_repeated_number_counts_once(tasks, model, tmp_path, shown):
     (one,) = asked(tasks[:1], model, tmp_path, (1, 1))
     assert len(one.distances) == 1
 
@@ -1302,7 +1302,7 @@ def test_every_method_is_on_the_page_with_its_numbers(many, text):
     assert displaced_by[0][1:] == list(DISPLACEMENTS) and kinds[0][1:] == [path.replace("_", " ") for path in PATHS]
 
 
-def test_the_worst_failures_are_listed_by_their_turn(many, text):
+def test_the_worst_failures_are_listed_in_order(many, text):
     ours = [one for one in many if one.method == "tdf_jax"]
     failed = sorted(
         (one for one in ours if one.distances[0] > 0.02 or one.angles[0] > 20),
@@ -1341,7 +1341,7 @@ def test_failures_of_others_are_not_listed(model):
 
 
 @pytest.mark.slow
-def test_without_confidences_and_demonstrations_their_parts_are_left_out(many, model, text):
+def test_without_confidences_and_demonstrations_their_parts_are_omitted(many, model, text):
     assert sections([made()], []) == {}
     bare = page(many, model, SETTINGS, {})
     for part in ("## Confidence", "reliability.png", "## Several demonstrations", "demonstrations.png"):
@@ -1349,7 +1349,7 @@ def test_without_confidences_and_demonstrations_their_parts_are_left_out(many, m
     assert len(tables(bare)) == 5
 
 
-def test_confidences_are_told_by_bins(many, text, extras):
+def test_confidences_are_reported_by_bins(many, text, extras):
     ours = [one for one in many if one.confidence is not None]
     rows = tables(text)[5][2:]
     assert len(rows) > 3 and sum(int(row[1]) for row in rows) == len(ours) == 60
@@ -1360,7 +1360,7 @@ def test_confidences_are_told_by_bins(many, text, extras):
     assert f"share of right picks is {extras['reliability']['calibration_error']:.3f}." in text
 
 
-def test_several_demonstrations_are_told(text):
+def test_several_demonstrations_are_reported(text):
     rows = tables(text)[6][2:]
     assert rows[0] == ["full", "1", "mean", "3", "1.20 / 3.44", "9.0 / 41.8", "33 %", "67 %", "67 %"]
     assert rows[1][:4] == ["full", "3", "median", "3"] and rows[1][6:] == ["67 %", "100 %", "100 %"]
@@ -1379,7 +1379,7 @@ def test_clouds_have_tables_of_their_own(many, model):
     assert "--clouds full noise" in text and len(tables(text)) == 3 + 3 + 1 + 1
 
 
-def test_the_page_tells_how_it_was_made(text):
+def test_the_page_states_how_it_was_made(text):
     assert (
         "`tdf benchmark --weights small --pairs 60 --seed 0 --height 0.12 --clouds full --num-starts 2`: "
         "20 objects, weights `small`, 2 starts" in text

@@ -219,7 +219,7 @@ def test_every_case_and_network_runs_the_programs_of_the_first(small_model):
     assert names == []
 
 
-def test_an_unknown_baseline_is_told_before_anything_runs():
+def test_an_unknown_baseline_raises_before_anything_runs():
     with pytest.raises(
         InputError, match=r"compare\(\): baselines has 'RANSAC'; expected some of random weights, PCA, ICP"
     ):

@@ -184,7 +184,7 @@ def test_truncated_and_trailing_bytes(saved, change):
     assert "not a valid safetensors file" in refusal(saved)
 
 
-def test_every_flipped_bit_is_noticed(saved):
+def test_every_flipped_bit_is_detected(saved):
     content = saved.read_bytes()
     header = 8 + int.from_bytes(content[:8], "little")
     rng = np.random.default_rng(0)

@@ -333,7 +333,7 @@ def test_missing_extra_and_misshapen_tensors_are_reported_together(tmp_path, wei
 @pytest.mark.parametrize(
     "name", ["encoder.fc_c.map_to_feat.weight", "decoder.z_in.map_to_feat.weight", "decoder.fc_in.weight"]
 )
-def test_a_tensor_that_tells_the_latent_size_may_be_the_wrong_one(tmp_path, weights, name):
+def test_a_tensor_that_determines_the_latent_size_may_be_the_wrong_one(tmp_path, weights, name):
     changed = weights | {name: np.zeros(weights[name].shape[::-1], np.float32)[:2]}
     message = refusal(write_checkpoint(tmp_path / "a.pth", changed))
     assert "latent size 3" in message and f"1 of another shape: {name}" in message
@@ -375,7 +375,7 @@ def test_truncated_file(tmp_path, kept):
     assert "truncated" in refusal(tmp_path / "a.pth")
 
 
-def test_every_flipped_byte_is_noticed_or_harmless(tmp_path):
+def test_every_flipped_byte_is_detected_or_harmless(tmp_path):
     """Nothing but an `InputError` is raised, and no other weights are read."""
     path, content = tmp_path / "a.pth", (FIXTURES / "ndf_latent32.pth").read_bytes()
     unchanged = flatten_dict(convert_checkpoint(FIXTURES / "ndf_latent32.pth").params, sep=".")

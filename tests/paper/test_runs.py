@@ -56,7 +56,7 @@ def made(curve=(1.0, 0.5), found=None, expected=None, **fields):
 # ---- settings ----
 
 
-def test_the_test_mug_lies_turned_by_the_angle_asked_for():
+def test_the_test_mug_is_rotated_by_the_given_angle():
     for turn in (0.0, 60.0, 180.0):
         R = settings.rotation(dataclasses.replace(TINY, turn=turn))
         np.testing.assert_allclose(np.degrees(Rotation.from_matrix(R).magnitude()), turn, atol=1e-6)
@@ -422,7 +422,7 @@ def test_landscapes_are_of_the_named_mug_with_the_demonstrations_orientation(sma
     np.testing.assert_allclose(line.minimisers[0], 0, atol=1e-9)
     np.testing.assert_allclose(line.carried, line.path)
     others = {name: energy_maps.figure2(small_model, base, name, 5)["wave"] for name in energy_maps.FIELDS}
-    turned = others["reference mug, turned"]
+    turned = others["reference mug, rotated"]
     flat = [panel.path - panel.outline.mean(axis=0) for panel in (own["wave"], turned)]
     R = Rotation.from_euler("z", 60, degrees=True).as_matrix()[:2, :2]
     np.testing.assert_allclose(turned.carried - turned.outline.mean(axis=0), flat[0] @ R.T, atol=1e-5)

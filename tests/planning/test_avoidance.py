@@ -1,4 +1,4 @@
-"""Clearance on the way, and trajectories pushed clear: ends kept, passages found, failures told."""
+"""Clearance on the way, and trajectories pushed clear: fixed ends, passages, reported failures."""
 
 import dataclasses
 
@@ -116,7 +116,7 @@ def test_a_wall_between_two_poses_is_seen_and_passed():
 
 
 @pytest.mark.slow
-def test_a_post_in_a_semicircle_is_passed_and_margins_are_kept():
+def test_a_post_in_a_semicircle_is_passed_with_the_margin():
     arc, post = tdf.semicircle(12, (0, 0, 0), (0, 0.4, 0)), box_obstacle((0.19, 0.2, 0), (0.03, 0.03, 0.6))
     assert clearance(arc, BODY, [post]).min < 0
     for margin in (0.005, 0.03):
@@ -174,10 +174,10 @@ def test_a_moved_scene_moves_the_result():
     np.testing.assert_allclose(there.rotations, expected.rotations, atol=1e-2)
 
 
-# What cannot be done is told
+# Failures are reported
 
 
-def test_a_goal_inside_of_an_obstacle_is_told():
+def test_a_goal_inside_of_an_obstacle_is_reported():
     around = box_obstacle((0, 0.4, 0), (0.2, 0.2, 0.2))
     cleared = push_clear(LINE, BODY, [AWAY, around], config=ONE_LOOK)
     ends_kept(cleared, LINE)
@@ -190,7 +190,7 @@ def test_a_goal_inside_of_an_obstacle_is_told():
 
 
 @pytest.mark.slow
-def test_a_closed_room_is_told():
+def test_a_closed_room_is_reported():
     """Six walls around the start: there is no way out."""
     sides = np.concatenate([np.eye(3), -np.eye(3)])
     room = [box_obstacle(0.11 * side, 0.3 - 0.28 * np.abs(side)) for side in sides]
@@ -201,7 +201,7 @@ def test_a_closed_room_is_told():
     assert cleared.clearance == pytest.approx(clearance(cleared.trajectory, BODY, room).min)
 
 
-def test_two_poses_leave_nothing_to_push_and_that_is_told():
+def test_two_poses_cannot_be_pushed_and_that_is_reported():
     two = tdf.line(2, (0, 0, 0), (0, 0.4, 0))
     cleared = push_clear(two, BODY, [IN_THE_WAY])
     np.testing.assert_array_equal(cleared.trajectory.wxyz_xyz, two.wxyz_xyz)
