@@ -1,4 +1,4 @@
-"""Time and memory of tdf_jax against PyTorch, in one run and in turns.
+"""Time and memory of tdf_jax against PyTorch, in one run, alternately.
 
     python -m bench --out results             # all rows: bench.json and bench.md; about half an hour on two cores
     python -m bench --only encode_1500 step_10
@@ -28,7 +28,7 @@ from tdf_jax._internal.files import replace_file
 
 BASELINE = Path(__file__).with_name("baseline.json")
 BUSY_LOAD = 0.5  # processes; a higher load slows PyTorch down much more than tdf_jax
-QUICK_ENERGIES = {"inits": 2, "poses": 3, "queries": 20}
+QUICK_ENERGIES = {"num_starts": 2, "poses": 3, "queries": 20}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

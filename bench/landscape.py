@@ -1,6 +1,6 @@
 """Time of energy landscapes: the shared sweep of a lattice against an evaluation for each grid point and query point.
 
-Both sweeps take turns in one run. They share each evaluation between waypoints and use the same sums. Compilation is
+Both sweeps alternate in one run. They share each evaluation between waypoints and use the same sums. Compilation is
 measured separately.
 
     python -m bench.landscape              # a plane

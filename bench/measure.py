@@ -1,4 +1,4 @@
-"""Measurement of one row: prepare every competitor, check that they agree, then repeat in turns."""
+"""Measurement of one row: prepare every competitor, check that they agree, then repeat alternately."""
 
 import dataclasses
 import statistics
@@ -21,7 +21,7 @@ class Plan(NamedTuple):
     Attributes:
         task: name of the task in the competitor's module.
         settings: settings of the task.
-        inits: number of starts, if not all of them fit into memory.
+        num_starts: number of starts, if not all of them fit into memory.
         once: whether its only call is measured, without a first call that warms up.
         scale: factor of its time, if it does only a part of the work of the row.
         note: note in the report.
@@ -29,7 +29,7 @@ class Plan(NamedTuple):
 
     task: str
     settings: dict = {}
-    inits: int | None = None
+    num_starts: int | None = None
     once: bool = False
     scale: float = 1.0
     note: str = ""
@@ -43,7 +43,7 @@ class Row:
         name, title: for options and the report.
         sizes: what a time depends on; times of two runs are compared where these are equal.
         arrays: makes the inputs, the same for all.
-        plans: competitors in the order they take turns.
+        plans: competitors in the order in which they alternate.
         check: from results by competitor to checks, and facts to report.
         flops: operations of the whole row, see `bench.flops`; of each competitor where they differ, 0 where they are
             not known.
@@ -95,7 +95,7 @@ def measure(row: Row, workers: Workers, state: dict, repetitions: int) -> dict:
                 failed[name] = str(error)
 
     def prepare(name, plan):
-        cut = arrays | {"starts": arrays["starts"][: plan.inits]} if plan.inits else arrays
+        cut = arrays | {"starts": arrays["starts"][: plan.num_starts]} if plan.num_starts else arrays
         workers.ask(name, "prepare", {"task": plan.task, "settings": plan.settings, "arrays": cut, "state": state})
         runs[name] = {"base": workers.ask(name, "settle")["resident"], "calls": [], "others": 0.0}
 
@@ -146,7 +146,7 @@ def measure(row: Row, workers: Workers, state: dict, repetitions: int) -> dict:
 
 
 def matmul_gflops(workers: Workers, state: dict, repetitions: int = 8) -> dict[str, float]:
-    """Float32 matmul peak of this machine, GFLOP/s: the best square product in each library's process, in turns."""
+    """Float32 matmul peak of this machine, GFLOP/s: the best square product in each library's process, alternately."""
     names, best = ("torch_tuned", "tdf_jax"), {}
     for name in names:
         workers.ask(name, "prepare", {"task": "matmul", "settings": {"size": MATRIX}, "arrays": {}, "state": state})

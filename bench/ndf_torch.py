@@ -12,11 +12,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-SCALING = 10.0  # of all coordinates before the network
+SCALING = 10.0  # factor on all coordinates before the network
 SLOPE = 0.2
 NEIGHBOURS = 20
 BLOCKS = 5
-HIDDEN, WIDTH = 128, 256  # of the encoder, for latents of any size
+HIDDEN, WIDTH = 128, 256  # channels of the encoder, for latents of any size
 EPSILON = 1e-6  # added to |d|^2
 
 
@@ -204,33 +204,35 @@ class Problem:
     rotation_scale: float
 
 
-def exponential(turn: Tensor) -> Tensor:
+def exponential(rotation_vector: Tensor) -> Tensor:
     """Matrices of rotation vectors, (..., 3); unlike the published Rodrigues formula it has a gradient at zero."""
-    x, y, z = turn.unbind(-1)
+    x, y, z = rotation_vector.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3)))
 
 
-def descriptor_losses(network: OccupancyNetwork, problem: Problem, R: Tensor, place: Tensor, first: int = 0) -> Tensor:
+def descriptor_losses(
+    network: OccupancyNetwork, problem: Problem, R: Tensor, centroid: Tensor, first: int = 0
+) -> Tensor:
     """Mean absolute differences of descriptors over poses, queries and channels, (starts,).
 
     Args:
         network: the network.
         problem: the demonstration and the target.
         R: orientations, (starts, poses, 3, 3).
-        place: positions of the centroid of the query points, (starts, poses, 3), world frame.
+        centroid: positions of the centroid of the query points, (starts, poses, 3), world frame.
         first: number of the demonstrated pose that the first pose is compared with.
     """
-    starts, n = place.shape[:2]
+    starts, n = centroid.shape[:2]
     centred = problem.query - problem.query.mean(0)
-    x = centred @ R.transpose(-1, -2) + place[:, :, None]
+    x = centred @ R.transpose(-1, -2) + centroid[:, :, None]
     found = network.descriptors((x - problem.origin).reshape(starts, -1, 3), problem.latents)
     there = problem.descriptors[first : first + n].reshape(-1, found.shape[-1])
     return torch.stack([F.l1_loss(one, there) for one in found])
 
 
-def pose_losses(problem: Problem, R: Tensor, place: Tensor) -> Tensor:
+def pose_losses(problem: Problem, R: Tensor, centroid: Tensor) -> Tensor:
     """K ||T_ref - T||, mean over poses, (starts,); the norm is zero with gradient zero where they agree."""
-    shift = place - R @ problem.query.mean(0) - problem.origin - problem.t_ref
-    turn = problem.rotation_scale * (R - problem.R_ref).flatten(-2)
-    return problem.correlation * torch.linalg.vector_norm(torch.cat([shift, turn], dim=-1), dim=-1).mean(-1)
+    shift = centroid - R @ problem.query.mean(0) - problem.origin - problem.t_ref
+    rotation = problem.rotation_scale * (R - problem.R_ref).flatten(-2)
+    return problem.correlation * torch.linalg.vector_norm(torch.cat([shift, rotation], dim=-1), dim=-1).mean(-1)

@@ -33,21 +33,21 @@ def encode(model, settings, arrays):
 
 
 def gradient(model, settings, arrays):
-    """Energies, and gradients with respect to turns and places of the query points' mean."""
+    """Energies, and gradients with respect to rotations and centroids of the query points."""
     field, reference, energy = _problem(model, arrays)
     centre = jnp.mean(reference.query, axis=0)
     R0 = se3.rotation(jnp.asarray(arrays["starts"]))
-    places = se3.transform(jnp.asarray(arrays["starts"]), centre[None])[..., 0, :]
+    centroids = se3.transform(jnp.asarray(arrays["starts"]), centre[None])[..., 0, :]
 
-    def value(turn, place, R):
-        R = se3.exp(turn) @ R
-        return tdf.trajectory_energy(tdf.Trajectory(se3.pose(R, place - R @ centre)), field, reference, energy)
+    def value(rotation, centroid, R):
+        R = se3.exp(rotation) @ R
+        return tdf.trajectory_energy(tdf.Trajectory(se3.pose(R, centroid - R @ centre)), field, reference, energy)
 
     program = jax.jit(jax.vmap(jax.value_and_grad(value, argnums=(0, 1))))
 
     def call():
-        energies, (turn, place) = jax.block_until_ready(program(jnp.zeros_like(places), places, R0))
-        return {"energies": energies, "turn": turn, "place": place}
+        energies, (rotation, centroid) = jax.block_until_ready(program(jnp.zeros_like(centroids), centroids, R0))
+        return {"energies": energies, "rotation": rotation, "centroid": centroid}
 
     return call
 

@@ -15,19 +15,19 @@ ORIGINAL = {"float32": 5e-5, "float64": 1e-10}
 ENERGIES, GRADIENTS = 1e-5, 1e-3  # gradients contain signs of differences, and rounding changes some of them
 
 
-def parity(workers: Workers, inits: int = 3, poses: int = 7, queries: int = 100) -> list[dict]:
+def parity(workers: Workers, num_starts: int = 3, poses: int = 7, queries: int = 100) -> list[dict]:
     """All checks, by the competitors' own processes.
 
     Args:
         workers: the competitors' processes.
-        inits: number of starts of the energies that are compared.
+        num_starts: number of starts of the energies that are compared.
         poses: number of poses.
         queries: number of query points.
 
     Raises:
         InputError: the golden outputs are not there.
     """
-    return original(workers) + energies(workers, inits, poses, queries)
+    return original(workers) + energies(workers, num_starts, poses, queries)
 
 
 def original(workers: Workers) -> list[dict]:
@@ -52,9 +52,9 @@ def original(workers: Workers) -> list[dict]:
     return checks
 
 
-def energies(workers: Workers, inits: int, poses: int, queries: int) -> list[dict]:
+def energies(workers: Workers, num_starts: int, poses: int, queries: int) -> list[dict]:
     """Energies of random starts and the gradients of their free poses, every competitor against the first."""
-    state, arrays = scene.weights(tdf.load_model("mug")), scene.imitation(inits, poses, queries)
+    state, arrays = scene.weights(tdf.load_model("mug")), scene.imitation(num_starts, poses, queries)
     found = {}
     for name in ("torch", "torch_tuned", "tdf_jax"):
         workers.ask(name, "prepare", {"task": "gradient", "settings": {}, "arrays": arrays, "state": state})

@@ -51,14 +51,14 @@ def encode(network, tuned, settings, arrays):
 
 
 def gradient(network, tuned, settings, arrays):
-    """Energies, and gradients with respect to turns and places of the query points' mean."""
-    problem, R0, places = _problem(network, arrays)
+    """Energies, and gradients with respect to rotations and centroids of the query points."""
+    problem, R0, centroids = _problem(network, arrays)
 
     def call():
-        turn, place = torch.zeros_like(places, requires_grad=True), places.clone().requires_grad_()
-        energies = _energies(network, problem, R0, turn, place)
+        rotation, centroid = torch.zeros_like(centroids, requires_grad=True), centroids.clone().requires_grad_()
+        energies = _energies(network, problem, R0, rotation, centroid)
         energies.sum().backward()
-        return {"energies": energies.detach(), "turn": turn.grad, "place": place.grad}
+        return {"energies": energies.detach(), "rotation": rotation.grad, "centroid": centroid.grad}
 
     return call
 
@@ -69,37 +69,37 @@ def descent(network, tuned, settings, arrays):
     Settings: steps to take, of `iterations` that the falling rates are laid out for; rates; fix_last; per "step" or
     "call".
     """
-    problem, R0, places = _problem(network, arrays)
+    problem, R0, centroids = _problem(network, arrays)
     iterations, steps, fix_last = settings["iterations"], settings["steps"], settings["fix_last"]
-    free = places.shape[1] - fix_last
+    free = centroids.shape[1] - fix_last
     shared = tuned and fix_last
 
-    def energies(turn, place, fixed):
-        turn = torch.cat([turn, torch.zeros_like(places[:, free:])], dim=1)
-        place = torch.cat([place, places[:, free:]], dim=1)
+    def energies(rotation, centroid, fixed):
+        rotation = torch.cat([rotation, torch.zeros_like(centroids[:, free:])], dim=1)
+        centroid = torch.cat([centroid, centroids[:, free:]], dim=1)
         if not shared:
-            return _energies(network, problem, R0, turn, place)
-        R = exponential(turn) @ R0
-        moving = descriptor_losses(network, problem, R[:, :free], place[:, :free])
-        return (free * moving + fixed) / places.shape[1] + pose_losses(problem, R, place)
+            return _energies(network, problem, R0, rotation, centroid)
+        R = exponential(rotation) @ R0
+        moving = descriptor_losses(network, problem, R[:, :free], centroid[:, :free])
+        return (free * moving + fixed) / centroids.shape[1] + pose_losses(problem, R, centroid)
 
     def call():
         began = time.perf_counter()
-        turn = torch.zeros_like(places[:, :free], requires_grad=True)
-        place = places[:, :free].clone().requires_grad_()
+        rotation = torch.zeros_like(centroids[:, :free], requires_grad=True)
+        centroid = centroids[:, :free].clone().requires_grad_()
         rates = settings["rotation_rate"], settings["translation_rate"]
-        adam = torch.optim.Adam([{"params": [turn]}, {"params": [place]}])
+        adam = torch.optim.Adam([{"params": [rotation]}, {"params": [centroid]}])
         fixed, losses = None, []
         if shared:
             with torch.no_grad():
-                fixed = descriptor_losses(network, problem, R0[:, free:], places[:, free:], first=free)
+                fixed = descriptor_losses(network, problem, R0[:, free:], centroids[:, free:], first=free)
         for step in range(steps):
             decay = settings["final_rate"] + (1 - settings["final_rate"]) * 0.5 * (
                 1 + np.cos(np.pi * step / iterations)
             )
             for group, rate in zip(adam.param_groups, rates):
                 group["lr"] = rate * decay
-            loss = energies(turn, place, fixed)
+            loss = energies(rotation, centroid, fixed)
             adam.zero_grad()
             loss.sum().backward()  # the sum, not the mean: Adam does not mind, and both sides then see the same numbers
             adam.step()
@@ -111,7 +111,7 @@ def descent(network, tuned, settings, arrays):
         }
         if steps == iterations and settings["per"] == "call":
             with torch.no_grad():
-                result["energies"] = energies(turn, place, fixed)
+                result["energies"] = energies(rotation, centroid, fixed)
         return result
 
     return call
@@ -167,7 +167,7 @@ TASKS = {task.__name__: task for task in (golden, encode, gradient, descent, lan
 
 
 def _problem(network: OccupancyNetwork, arrays):
-    """The problem, and every start's orientations and places of the query points' mean."""
+    """The problem, and every start's orientations and centroids of the query points."""
     shown, new, query = arrays["shown"], arrays["new"], arrays["query"]
     R, t = _matrices(arrays["path"])
     with torch.no_grad():
@@ -181,9 +181,9 @@ def _problem(network: OccupancyNetwork, arrays):
     return problem, R0, R0 @ query.mean(0) + t0
 
 
-def _energies(network, problem, R0, turn, place):
-    R = exponential(turn) @ R0
-    return descriptor_losses(network, problem, R, place) + pose_losses(problem, R, place)
+def _energies(network, problem, R0, rotation, centroid):
+    R = exponential(rotation) @ R0
+    return descriptor_losses(network, problem, R, centroid) + pose_losses(problem, R, centroid)
 
 
 def _matrices(wxyz_xyz):

@@ -37,7 +37,7 @@ def _heading(record):
         "# tdf_jax against PyTorch",
         f"{machine['cpu']}, {machine['cores']} cores, {machine['memory_gigabytes']} GB, {machine['system']}; "
         f"load {machine['load']} at the start. {versions}. Float32 matmul peak, GFLOP/s: {peaks}.",
-        "All competitors have the same weights and inputs and take turns in one run, each in a process of its own. "
+        "All competitors have the same weights and inputs and alternate in one run, each in a process of its own. "
         "Times are medians (least to most) after a first call that warms up; ratios are of medians (and of least "
         "times). (a) PyTorch as NDF's users run it: weights record gradients, and the standard allocator is used. "
         "(b) PyTorch tuned by an expert: no gradients for weights that are not trained, one thread for each core, a "

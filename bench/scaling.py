@@ -10,7 +10,8 @@ from bench.rows import encoding, step
 from bench.workers import COMPETITORS, Workers
 from tdf_jax._internal.files import replace_file
 
-CENTRE = {"inits": 4, "poses": 7, "queries": 250}  # the others while one varies
+# Sizes that do not vary along an axis. "inits" is the number of starts: keys of records stay comparable.
+CENTRE = {"inits": 4, "poses": 7, "queries": 250}
 VALUES = {
     "inits": (1, 2, 4, 8, 16, 32),
     "poses": (2, 4, 7, 14, 28),
@@ -22,7 +23,7 @@ LABELS = {"inits": "starts M", "poses": "poses n", "queries": "query points Q", 
 
 
 def scaling(workers: Workers, state: dict, quick: bool, repetitions: int, progress=print) -> dict:
-    """Measure the curves; a competitor whose graph would not fit into memory is left out at that size.
+    """Measure the curves; a competitor whose graph would not fit into memory is excluded at that size.
 
     Returns:
         {axis: [{"value", "competitors": {name: {"seconds", "megabytes"}}}]}; one step per value of M, n and Q, one
@@ -33,7 +34,11 @@ def scaling(workers: Workers, state: dict, quick: bool, repetitions: int, progre
     for axis, steps in values.items():
         curves[axis] = []
         for value in steps:
-            row = encoding(value) if axis == "points" else step(**(centre | {axis: value}))
+            sizes = centre | {axis: value}
+            if axis == "points":
+                row = encoding(value)
+            else:
+                row = step(sizes["inits"], sizes["poses"], sizes["queries"])
             for name, plan in list(row.plans.items()):
                 if plan.scale != 1:
                     del row.plans[name]

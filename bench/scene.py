@@ -44,34 +44,34 @@ def cloud(points: int) -> Float[np.ndarray, "points 3"]:
     return sampled - sampled.mean(axis=0)
 
 
-def imitation(inits: int, poses: int, queries: int, seed: int = 0) -> dict[str, np.ndarray]:
+def imitation(num_starts: int, poses: int, queries: int, seed: int = 0) -> dict[str, np.ndarray]:
     """A wave demonstrated at the handle of one mug, and random starts at another mug.
 
     Clouds have the density of the weights' training clouds, so that a single encoding, the same in all competitors, is
     enough.
 
     Args:
-        inits: number of starts.
+        num_starts: number of starts.
         poses: number of poses of the trajectory.
         queries: number of query points.
         seed: seed of the query points, the new mug's rotation and the starts.
 
     Returns:
         "shown" and "new": clouds, (256, 3); "path": the demonstration, (poses, 7); "query": (queries, 3); "goal": (7,);
-        "starts": (inits, poses, 7), the whole demonstration rotated about the object by uniform rotations, with the
+        "starts": (starts, poses, 7), the whole demonstration rotated about the object by uniform rotations, with the
         goal as the last pose. Metres, `wxyz_xyz`, world frame.
     """
     shown, new = (tdf.thin(surface(index, 1500), 256) for index in (0, 1))
-    turn = Rotation.random(random_state=seed)
-    new = (turn.apply(new) + (0.1, -0.05, 0.02)).astype(np.float32)
+    R_new = Rotation.random(random_state=seed)
+    new = (R_new.apply(new) + (0.1, -0.05, 0.02)).astype(np.float32)
     start = handle()
     path = np.asarray(tdf.wave(poses, start=start, end=start + [0.0, 0.3, 0.1]).wxyz_xyz, np.float64)
     origins = shown.mean(axis=0, dtype=np.float64), new.mean(axis=0, dtype=np.float64)
     goal = path[-1] + [0, 0, 0, 0, *(origins[1] - origins[0])]
     starts = []
-    for rotation in Rotation.random(inits, random_state=seed + 1):
-        turned = (rotation * Rotation.from_quat(path[:, :4], scalar_first=True)).as_quat(scalar_first=True)
-        starts.append(np.concatenate([turned, rotation.apply(path[:, 4:] - origins[0]) + origins[1]], axis=1))
+    for rotation in Rotation.random(num_starts, random_state=seed + 1):
+        rotated = (rotation * Rotation.from_quat(path[:, :4], scalar_first=True)).as_quat(scalar_first=True)
+        starts.append(np.concatenate([rotated, rotation.apply(path[:, 4:] - origins[0]) + origins[1]], axis=1))
         starts[-1][-1] = goal
     query = tdf.box_query(jax.random.key(seed), count=queries, size=0.08)
     arrays = {"shown": shown, "new": new, "path": path, "query": query, "goal": goal, "starts": np.stack(starts)}
@@ -132,6 +132,6 @@ def sweep(count: int, rotations: int, poses: int, lattice: tuple[int, int, int],
     arrays = imitation(1, poses, 1)
     grid = plane(count, pitch, arrays["new"])
     angles = np.arange(rotations) * np.pi / rotations
-    turns = Rotation.from_rotvec(angles[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+    matrices = Rotation.from_rotvec(angles[:, None] * [0.0, 0.0, 1.0]).as_matrix()
     arrays |= {"query": np.asarray(tdf.lattice_query(lattice, pitch), np.float32)}
-    return arrays | {"grid": grid.points.astype(np.float32), "rotations": turns.astype(np.float32)}
+    return arrays | {"grid": grid.points.astype(np.float32), "rotations": matrices.astype(np.float32)}

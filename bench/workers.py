@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 KEPT = str(8 * 2**30)  # bytes glibc may keep or grow the heap by, rather than ask the system for every large tensor
 TUNED = {"MALLOC_MMAP_THRESHOLD_": KEPT, "MALLOC_TRIM_THRESHOLD_": KEPT}
 
-CPU = {"JAX_PLATFORMS": "cpu"}  # where PyTorch runs
+CPU = {"JAX_PLATFORMS": "cpu"}  # environment of PyTorch's processes
 
 
 class Competitor(NamedTuple):
@@ -86,7 +86,7 @@ class Worker:
 
 
 class Workers:
-    """Children by competitor, each started when first asked; one that died is started anew."""
+    """Children by competitor, each starts at its first request; one that died is restarted."""
 
     def __init__(self):
         self._started = {}

@@ -80,7 +80,7 @@ def test_the_peers_energies_and_gradients_are_ours(golden, state, small_scene, t
         expected = ours.prepare("gradient", False, {}, small_scene, state)()
     found = peer.prepare("gradient", tuned, {}, small_scene, state)()
     assert relative_error(found["energies"], expected["energies"]) < 1e-5
-    for name in ("turn", "place"):  # of the free poses: the last one lies where eq. 3's norm has its kink
+    for name in ("rotation", "centroid"):  # of the free poses: the last one lies where eq. 3's norm has its kink
         assert relative_error(found[name][:, :-1], expected[name][:, :-1]) < 1e-3
 
 
@@ -145,7 +145,7 @@ def row(**settings):
     return Row("made_up", "made up", {"size": 1}, dict, plans, agree({"value": 1e-3}), 8e9)
 
 
-def test_competitors_take_turns_after_a_first_call():
+def test_competitors_alternate_after_a_first_call():
     workers = Scripted({"torch": 4.0, "torch_tuned": 2.0, "tdf_jax": 0.5})
     found = measure(row(torch={}, torch_tuned={"once": True}, tdf_jax={}), workers, {}, 2)
     assert workers.order == ["torch", "torch_tuned", "tdf_jax", "torch", "tdf_jax", "torch", "tdf_jax"]
@@ -278,9 +278,9 @@ def test_full_sizes_have_the_rows_and_their_operations():
 def test_what_does_not_fit_into_memory_is_measured_with_fewer_starts(monkeypatch):
     monkeypatch.setattr(all_rows.machine, "available", lambda: 5e9)
     found = all_rows.step(64, 7, 500)
-    assert found.plans["torch"].inits == 12 and found.plans["torch"].scale == 64 / 12
+    assert found.plans["torch"].num_starts == 12 and found.plans["torch"].scale == 64 / 12
     assert found.plans["torch"].note == "12 starts, the most that fit into memory; time x 64/12"
-    assert found.plans["tdf_jax"].inits is None and found.plans["tdf_jax"].scale == 1
+    assert found.plans["tdf_jax"].num_starts is None and found.plans["tdf_jax"].scale == 1
 
 
 @pytest.fixture(scope="module")
