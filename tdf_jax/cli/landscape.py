@@ -38,11 +38,11 @@ from tdf_jax.viz import html
 RESULT = "result.json"
 NAMES = (RESULT, "landscape.npz", "map.png", "isosurface.png", "slices.gif", "landscape.html")
 SCHEMA = 2  # raised when a key of result.json changes its name or its meaning
-STREAM = 0x1A2D5CA9  # folded into the seed's key
-SAVE_SECONDS = 20.0  # between saves of an unfinished sweep
-NUMBER = 4  # bytes
-MAX_QUERIES = 4096  # of a lattice; each needs tens of kilobytes
-MAX_PATH_POINTS = 1_000_000  # of a grid for the lowest-cost path, which needs about a kilobyte each
+STREAM = 0x1A2D5CA9  # number that is folded into the seed's key
+SAVE_SECONDS = 20.0  # interval between saves of an unfinished sweep
+NUMBER = 4  # bytes of a float32 number
+MAX_QUERIES = 4096  # query points of a lattice; each needs tens of kilobytes
+MAX_PATH_POINTS = 1_000_000  # grid points for the lowest-cost path, which needs about 1 kB for each
 
 
 def landscape(settings: Annotated[LandscapeSettings, tyro.conf.arg(name="")] = LandscapeSettings()) -> None:

@@ -27,7 +27,7 @@ CHOSEN = {
     "fig4": ("trajectory", "displacement"),
     "fig5": ("trajectory",),
 }
-RUNS = "runs"  # folder of what was computed
+RUNS = "runs"  # folder of computed runs
 GRID, FAST_GRID = 101, 31
 FAST = {"num_starts": 2, "iterations": 60, "queries": 24}
 

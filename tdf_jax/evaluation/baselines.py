@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from scipy.spatial import KDTree
 
 METHODS = ("PCA", "ICP")
-MAX_STEPS = 100  # of ICP
+MAX_STEPS = 100  # maximal number of steps of ICP
 TOLERANCE = 1e-4  # ICP stops at a step that lowers its mean squared distance by no more than this share
-SIGNS = np.array([(x, y, x * y) for x in (1, -1) for y in (1, -1)])  # of principal axes, without reflections
+SIGNS = np.array([(x, y, x * y) for x in (1, -1) for y in (1, -1)])  # signs of principal axes without reflections
 
 
 def principal_axes(

@@ -51,7 +51,7 @@ ABOUT_CARRIED = {
 COMPENSATED = "TDF, l_p"
 # The paper gives no weight of eq. 6; this is the weight of the term that eq. 6 was to replace.
 COMPENSATOR = EnergyWeights(0.0, compensator=0.02)
-STREAM = 0xBE9C4  # folded into the key of starts
+STREAM = 0xBE9C4  # number that is folded into the key of starts
 
 
 @dataclasses.dataclass(frozen=True)

@@ -28,7 +28,7 @@ PICTURES = {
 # Thresholds that the tables show; the record has all of them. Baselines reach no finer one.
 SHOWN = {name: THRESHOLDS[name] for name in ("1cm_10deg", "2cm_20deg", "5cm_30deg")}
 HEADS = [threshold.label("°") for threshold in SHOWN.values()]
-LISTED = 12  # failures that the page lists
+LISTED = 12  # number of failures that the page lists
 
 
 def page(scores: Sequence[Score], model: Model, settings: Mapping[str, Any], extras: Mapping[str, Any]) -> str:

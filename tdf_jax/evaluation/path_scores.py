@@ -19,8 +19,8 @@ from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.networks.model import Model, fingerprint
 from tdf_jax.uncertainty.calibration import confidence
 
-FORMAT = 1  # of what is kept: raised when an attempt is computed otherwise
-LEAST_JERK = 1e-4  # metres
+FORMAT = 1  # format number; raise it when the computation of an attempt changes
+LEAST_JERK = 1e-4  # smallest denominator of a ratio of jerks, metres
 
 
 def run(

@@ -21,7 +21,7 @@ from tdf_jax.geometry.trajectory import Trajectory
 DISPLACEMENTS = {"none": 0.0, "10 cm": 0.1, "30 cm": 0.3, "opposite": None}
 NUM_POSES = 7
 MESHES = 24_000_000  # number of the first task on a real mesh
-QUERY_STREAM = 0x9E57  # folded into the key of query points
+QUERY_STREAM = 0x9E57  # number that is folded into the key of query points
 
 
 @dataclasses.dataclass(frozen=True)

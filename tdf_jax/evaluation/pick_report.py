@@ -27,7 +27,7 @@ MEANINGS = {
     "double": "twice as large",
 }
 
-Outcomes = Mapping[tuple[str, str], Sequence[Outcome]]  # by objects and condition of the cloud
+Outcomes = Mapping[tuple[str, str], Sequence[Outcome]]  # outcomes by objects and condition of the cloud
 
 
 def label(category: str, real: bool = False) -> str:

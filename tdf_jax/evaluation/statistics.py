@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-RESAMPLES = 2000  # of the bootstrap
+RESAMPLES = 2000  # number of resamples of the bootstrap
 INTERVAL = (2.5, 97.5)  # percentiles of a 95 % interval
 
 

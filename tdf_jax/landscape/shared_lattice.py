@@ -25,7 +25,7 @@ from tdf_jax.networks.field import DescriptorField
 
 # Tolerance of whole steps, relative to a step; float32 rounds query points to 3e-6 of 12 mm.
 STEP_TOLERANCE = 2e-5
-NODES = 8192  # at most in a tile with the span of a layer; their descriptors take 67 MB
+NODES = 8192  # largest number of nodes of a tile with the span of a layer; their descriptors take 67 MB
 CHUNK_POINTS = 512  # points of the field that are evaluated at once, as in `optimize`
 # Channels that one fused loop adds up. If they are written out one by one, XLA vectorises along the last axis of the
 # grid and has the sums in registers: 20 to 25 billion differences per second on two AVX-512 cores. A reduction over the

@@ -18,8 +18,8 @@ from tdf_jax.geometry.grid import Grid
 REDUCTIONS = ("min", "softmin", "assigned", "mean")
 # Choices of the release before; they are accepted for one release, with a DeprecationWarning.
 DEPRECATED_REDUCTIONS = {"least": "min", "soft_least": "softmin"}
-TEMPERATURE = 5e-4  # of the softmin; the energy of a waypoint is about 0.002 at a match and 0.01 far away
-FORMAT = 2  # of files; raised if a field is removed or its meaning changes
+TEMPERATURE = 5e-4  # temperature of the softmin; the energy of a waypoint is about 0.002 at a match and 0.01 far away
+FORMAT = 2  # format number of files; raise it if a field is removed or its meaning changes
 READABLE_FORMATS = (1, 2)  # files of format 1 have the former names of the reductions
 FRAME = "world"
 

@@ -16,9 +16,9 @@ from tdf_jax.networks.field import DescriptorField
 from tdf_jax.networks.model import Model
 from tdf_jax.networks.occupancy import condition, encode_latent
 
-CENTRED = 1e-7  # of a cloud's extent: a mean below this is float32's rounding
+CENTRED = 1e-7  # share of a cloud's extent; a smaller mean is float32's rounding
 PADDING = 250  # sizes of clouds of unknown density are padded to a multiple of this; common sizes are multiples
-NUM_SUBSAMPLES = 8  # 16 gain another 0.003 of IoU
+NUM_SUBSAMPLES = 8  # 16 subsamples raise the IoU by another 0.003
 # Radians. Latents of subsamples of one mug are rotated against each other by 1 to 2 degrees, those of symmetric objects
 # by 60 to 90 on average.
 SAME_SIDE = np.pi / 6

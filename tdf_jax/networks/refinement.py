@@ -17,7 +17,7 @@ POINTS = 1500  # points that are used; clouds of all sizes are resized to it and
 # Length of the first step, of the latent's root mean square vector. Twice as much fits the noise of 2 mm, six times as
 # much destroys the shape.
 RATE = 0.003
-DECAYS = 0.9, 0.999  # of Adam's moments
+DECAYS = 0.9, 0.999  # decay rates of Adam's moments
 
 
 def refine(model: Model, field: DescriptorField, points: Float[Array, "points 3"], steps: int = 40) -> DescriptorField:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from tdf_jax.geometry.winding import libigl
 from tdf_jax.networks.field import DescriptorField
 
-CELLS = 120  # along the diagonal of the searched box: 1.7 mm on a common mug; coarser cells tear its wall into stripes
+CELLS = 120  # cells along the box's diagonal: 1.7 mm on a common mug; coarser cells tear its wall into stripes
 CHUNK_POINTS = 20_000  # points evaluated at a time
 
 

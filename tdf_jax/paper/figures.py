@@ -13,7 +13,7 @@ from tdf_jax.paper.setting import SHAPES, Setting
 Runner = Callable[[Setting], Run]
 
 DISPLACED = (-0.2, 0.1, 0.3)  # displacement of the endpoint in figure 4
-DISTANCES = (0.15, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0)  # from the centroid of the cloud
+DISTANCES = (0.15, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0)  # distances from the centroid of the cloud
 PAPER_DISTANCES = (0.5, 1.0, 2.0)
 DISTANCE_SEEDS = 2
 

@@ -19,7 +19,7 @@ from tdf_jax.paper import setting as settings
 from tdf_jax.paper.setting import Setting
 from tdf_jax.solvers.adam import optimize
 
-SETTLED = 0.95  # share of the drop of the loss
+SETTLED = 0.95  # share of the drop of the loss after which it counts as settled
 DENSE = 61  # poses of the true path that a path of any number of poses is compared with
 FLIPPED = np.radians(FLIP_DEGREES)
 
@@ -32,9 +32,9 @@ class Run:
         reference: the demonstration, (poses, 7).
         expected: ground truth on the test mug, (poses, 7).
         path: translations of the ground truth with `DENSE` poses, (dense, 3), metres, world frame.
-        initial_trajectories: initial trajectory of every start, (inits, poses, 7).
-        trajectories: final trajectory of every start, (inits, poses, 7).
-        losses: energy of every start before each iteration and after the last, (inits, iterations + 1).
+        initial_trajectories: initial trajectory of every start, (starts, poses, 7).
+        trajectories: final trajectory of every start, (starts, poses, 7).
+        losses: energy of every start before each iteration and after the last, (starts, iterations + 1).
         descriptor: l_t alone, of the best start's trajectory and of the ground truth, (2,).
         expected_energy: energy of the ground truth.
     """
@@ -42,9 +42,9 @@ class Run:
     reference: Float[np.ndarray, "poses 7"]
     expected: Float[np.ndarray, "poses 7"]
     path: Float[np.ndarray, "dense 3"]
-    initial_trajectories: Float[np.ndarray, "inits poses 7"]
-    trajectories: Float[np.ndarray, "inits poses 7"]
-    losses: Float[np.ndarray, "inits iterations_and_1"]
+    initial_trajectories: Float[np.ndarray, "starts poses 7"]
+    trajectories: Float[np.ndarray, "starts poses 7"]
+    losses: Float[np.ndarray, "starts iterations_and_1"]
     descriptor: Float[np.ndarray, "2"]
     expected_energy: Float[np.ndarray, ""]
 

@@ -13,7 +13,7 @@ from tdf_jax.paper.energy_maps import Swept, figure2
 from tdf_jax.paper.runs import Run, imitation
 from tdf_jax.paper.setting import SHAPES, Setting
 
-FORMAT = 3  # of the files and their content: raised when a run is computed otherwise
+FORMAT = 3  # format number; raise it when the computation of a run or the content of a file changes
 
 
 class Store:

@@ -149,7 +149,7 @@ def push_clear(
     checks.number("push_clear()", "margin", margin, least=0, unit="metres")
     wxyz_xyz, points, groups, order = prepare("push_clear()", trajectory, body, obstacles)
     measured, distances, _ = measure(wxyz_xyz, points, groups, order, motion_samples(wxyz_xyz, points, STEP) - 1)
-    ends = distances[[0, -1]]  # in the order of the groups
+    ends = distances[[0, -1]]  # columns are in the order of the groups
     length = path_lengths(wxyz_xyz, points, config.rotation_scale)
 
     def required(at):

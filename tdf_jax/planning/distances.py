@@ -21,7 +21,7 @@ from tdf_jax.geometry.trajectory import Trajectory, check_trajectory
 # it is thinner than that.
 STEP = 0.005
 MAX_BETWEEN = 255  # samples between two poses
-ROUNDING = 1e-5  # metres
+ROUNDING = 1e-5  # rounding error of a distance, metres
 
 
 class Obstacle(Protocol):

@@ -13,7 +13,7 @@ from tdf_jax.shapes.shape import Shape, Solid, check_dimensions, draw_valid, fra
 from tdf_jax.shapes.solid import Loft, inset, section
 
 _PROFILE = 60  # points along the side's profile
-_FLARE_FROM = 0.8  # of the side's height, at which a flared or drawn-in rim begins
+_FLARE_FROM = 0.8  # share of the side's height at which a flared or drawn-in rim begins
 
 
 @dataclass(frozen=True)

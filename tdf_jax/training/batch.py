@@ -16,34 +16,34 @@ from tdf_jax.training.labels import BOX_PADDING
 DIAGONALS = (0.08, 0.5)  # metres; every draw rescales its pair to a diagonal that is log-uniform in this range
 USUAL_DIAGONALS = (0.12, 0.25)  # metres; half of the draws use this range instead, that of real mugs
 PAIR_SPREAD = 0.15  # the objects of a pair have about one size: each differs from the pair's by up to this share
-VALIDATION_DIAGONAL = 0.18  # metres
+VALIDATION_DIAGONAL = 0.18  # diagonal of validation objects, metres
 DENSE_POINTS = 2000  # points of a complete cloud before farthest-point sampling
 
 # Corruptions of clouds by a sensor, at full strength. Shares are of the clouds.
-PARTIAL_SHARE = 0.6  # seen by one, two or four cameras
-SPARSE_SHARE = 0.3  # with a number of points before farthest-point sampling that is log-uniform in `SPARSE_POINTS`
+PARTIAL_SHARE = 0.6  # clouds that one, two or four cameras see
+SPARSE_SHARE = 0.3  # clouds whose density before farthest-point sampling is log-uniform in `SPARSE_POINTS`
 SPARSE_POINTS = (300, DENSE_POINTS)
-# With normal noise of a standard deviation of up to `NOISE` of the diagonal, which is 2.5 mm on a real mug.
+# Clouds with normal noise, whose standard deviation is at most `NOISE` of the diagonal: 2.5 mm on a real mug.
 NOISY_SHARE = 0.3
 NOISE = 0.015
-OUTLIER_SHARE = 0.2  # with some points anywhere in the padded box
+OUTLIER_SHARE = 0.2  # clouds with some points anywhere in the padded box
 OUTLIERS = 0.005  # largest share of such points; farthest-point sampling keeps nearly all: up to 4 % of a subsample
 
-# A box of query points is shown at a place of one object of a pair, and offered to the other one at the same place and
-# at wrong poses.
+# A box of query points is demonstrated at a place of one object of a pair. Candidates on the other object are the same
+# place and wrong poses.
 FIRST_SHARE = 0.6  # share of the boxes at the first place of an object, a mug's handle; the other places share the rest
-BOX_SIDES = (0.25, 0.55)  # of the pair's diagonal
+BOX_SIDES = (0.25, 0.55)  # edges of a box, shares of the pair's diagonal
 REMOTE_SHARE = 0.35  # share of the boxes that are not at the place but fixed to it at a distance
-REMOTE_DISTANCES = (0.1, 1.5)  # of the pair's diagonal, log-uniform
+REMOTE_DISTANCES = (0.1, 1.5)  # distances from the place, shares of the pair's diagonal, log-uniform
 # Share of the wrong poses with any rotation and any position about the object; the others are near the right pose.
 GLOBAL_SHARE = 0.4
-GLOBAL_SPREAD = 0.35  # standard deviation of the position, of the diagonal
-NEAR_ANGLES = (3.0, 90.0)  # degrees, log-uniform
-NEAR_DISTANCES = (0.01, 0.3)  # of the pair's diagonal, log-uniform
+GLOBAL_SPREAD = 0.35  # standard deviation of the position, share of the diagonal
+NEAR_ANGLES = (3.0, 90.0)  # rotation errors of wrong poses, degrees, log-uniform
+NEAR_DISTANCES = (0.01, 0.3)  # translation errors, shares of the pair's diagonal, log-uniform
 # Rotations about the axis that are tried for the equivalent poses of a symmetric object: these are all of them, except
 # of a round object, which has any.
 QUARTERS = 4
-# Least root mean square distance of a wrong pose's query points from those of all right poses, of the pair's diagonal.
+# Least root mean square distance between query points of wrong and right poses, share of the pair's diagonal.
 MIN_WRONG = 0.01
 
 

@@ -15,10 +15,10 @@ from tdf_jax.geometry.winding import inside, winding_number
 from tdf_jax.io.meshes import file_axes, load_mesh
 from tdf_jax.shapes import FAMILIES
 
-UNIFORM_SHARE = 0.5  # of the query points are uniform in the padded bounding box; the others lie near the surface
-BOX_PADDING = 0.10  # of the diagonal, on every side
+UNIFORM_SHARE = 0.5  # share of query points that are uniform in the padded box; the others lie near the surface
+BOX_PADDING = 0.10  # padding on every side, share of the diagonal
 # Half of the points near the surface lie within the thickness of a wall (2 mm on a real mug), half further away.
-NEAR_SPREADS = (0.012, 0.05)  # standard deviations, of the diagonal
+NEAR_SPREADS = (0.012, 0.05)  # standard deviations, shares of the diagonal
 MIN_INSIDE = 0.002  # share of the uniform query points; real mugs have 0.07 to 0.09, a thin bowl 0.008
 
 

@@ -19,8 +19,8 @@ INTERCEPT, SLOPE = -3.39, 6.55
 FITTED_ON = 61  # seed of the picks
 CALIBRATED = ("mug",)  # shipped weights for which the curve is fitted
 MAX_CONFIDENCE = 0.99  # none of the 250 surest picks was wrong, which supports no higher probability
-EDGES = 0.0, 0.25, 0.5, 0.75, 0.9, 0.98, 1.0  # of the bins; they are narrow near 1 because most picks are sure
-MAX_POINTS = 1500  # of a cloud; the fixed number lets clouds of all sizes run one program
+EDGES = 0.0, 0.25, 0.5, 0.75, 0.9, 0.98, 1.0  # edges of the bins, which are narrow near 1 because most picks are sure
+MAX_POINTS = 1500  # points of a cloud; the fixed number lets clouds of all sizes run one program
 MAX_LOGIT = 3.0  # larger occupancy logits are clipped, so that a few stray points do not dominate the mean
 
 # Logistic curves in (-log residual, surface logit) by the name of shipped weights: the intercept and two slopes, fitted

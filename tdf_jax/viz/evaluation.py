@@ -13,7 +13,7 @@ from tdf_jax.viz.scene3d import WIDTH, View, bounds, panels, triangles_of
 from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, STYLE, TRUTH, blank_figure, legend_of
 
 LINES = ("-", "--", "-.", ":")
-MAX_ERROR = 20.0  # centimetres, the end of the axis
+MAX_ERROR = 20.0  # end of the axis, centimetres
 
 
 def truth_figure(tasks: Sequence[Task]) -> Figure:

@@ -63,7 +63,7 @@ def imitation_figure(
 
 
 def loss_figure(
-    losses: Float[np.ndarray, "inits iterations"], best: int, title: str = "", rows: str = "start"
+    losses: Float[np.ndarray, "starts iterations"], best: int, title: str = "", rows: str = "start"
 ) -> Figure:
     """Loss against iteration of every start, as in figure 5 of the paper.
 

@@ -36,13 +36,13 @@ if TYPE_CHECKING:
     import trimesh
 
 COLUMNS = 4
-PANEL = 1.75  # inches
+PANEL = 1.75  # edge of a panel, inches
 CONTOURS = 12
 NEAR = 1.5  # steps of the grid; points of an object within this distance of the plane are drawn on a map
 LEVELS = (0.02, 0.10)  # shares of a volume inside its surfaces of equal energy
 SURFACES = COLOURS(0.15), COLOURS(0.75)
 SEE_THROUGH = 0.30
-MAX_PANELS = 24  # of waypoints on a map; more waypoints are subsampled evenly
+MAX_PANELS = 24  # waypoints on a map; more waypoints are subsampled evenly
 FRAMES_A_SECOND = 8
 GIF_DPI = 100
 SHOWN = 1500  # points of an object's cloud that are drawn

@@ -14,10 +14,10 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 SURFACE_COLOUR = np.array([0.93, 0.90, 0.86])
 SHADE = 0.5  # brightness of a face parallel to the light
-WIDTH = 0.7  # of all edges, typographic points
+WIDTH = 0.7  # width of all edges, typographic points
 CUTS = 8  # pieces along a box's edge
 CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
-EDGES = [(i, i + step) for step in (4, 2, 1) for i in range(8) if not i & step]  # along x, y and z
+EDGES = [(i, i + step) for step in (4, 2, 1) for i in range(8) if not i & step]  # edges along x, y and z
 FRONT = (4, 5, 7, 6)  # the face towards +x
 
 

@@ -32,8 +32,8 @@ from tdf_jax.viz.style import (
 if TYPE_CHECKING:
     import trimesh
 
-WIDTH = 7.2  # inches, the text of a page
-SHOWN_POINTS = 1500  # of a cloud; more of them run together at the width of a page
+WIDTH = 7.2  # width of a page's text, inches
+SHOWN_POINTS = 1500  # points of a cloud; more points overlap at the width of a page
 VIEW = {"elev": 22.0, "azim": -38.0}  # the handle faces the reader, and the path runs to the right
 MOST_TRIANGLES = 40_000  # a mesh with more triangles is drawn as points, because matplotlib would take seconds
 

@@ -13,7 +13,7 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from tdf_jax._internal.files import replace_file
 
-COLOURS = matplotlib.colormaps["viridis"]  # readable in grey and by the colour-blind
+COLOURS = matplotlib.colormaps["viridis"]  # this map is readable in grey and by the colour-blind
 CLOUD, INK, TRUTH = "#56616e", "#222222", "#d1495b"
 CENTIMETRES = 100.0  # unit of pictures; all other code uses metres
 STYLE: dict[Any, Any] = {
