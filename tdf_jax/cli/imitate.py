@@ -54,7 +54,7 @@ def imitate(settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()) 
 
 
 def _run(settings: Settings, folder: Path) -> dict:
-    """Do the work, fill the folder, return the record."""
+    """Imitate, write the folder and return the record."""
     seconds = {}
     began = time.perf_counter()
     query_key, start_key = jax.random.split(jax.random.fold_in(jax.random.key(settings.seed), STREAM))

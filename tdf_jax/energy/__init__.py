@@ -3,6 +3,6 @@
 Modules:
     descriptors: eq. 1: descriptors of poses and trajectories
     losses: eq. 2, 3 and 6: the energy of one trajectory
-    reference: what one or several demonstrations ask for
-    residual: what a pick leaves unmatched
+    reference: descriptors and poses to match
+    residual: normalised energy of a pick
 """

@@ -200,7 +200,7 @@ def _wanted(category: str, has_front: bool) -> str:
 
 
 def _axes(entry: dict, category: str, refuse) -> np.ndarray:
-    """R_file_object."""
+    """Compute R_file_object from the axes `up` and `front` or `handle` of an entry."""
     side, up = "handle" if category == "mug" else "front", entry["up"]
     if not isinstance(up, str) or up not in AXES:
         refuse(f"up is {up!r}", f"one of {', '.join(AXES)}")
@@ -220,7 +220,7 @@ def _axes(entry: dict, category: str, refuse) -> np.ndarray:
 
 
 def _axes_of(up: str, front: list, refuse) -> np.ndarray:
-    """R_file_object for a front that is not an axis of the file."""
+    """Compute R_file_object from a front that is not an axis of the file."""
     try:
         x, z = np.array(front, float), AXES[up]
     except (TypeError, ValueError):

@@ -150,7 +150,7 @@ def _closest_points(task, model, encoded, key, num_starts) -> Attempt:
 
 
 def _oracle(task, *_) -> Attempt | None:
-    """The rigid motion that fits corresponding points near the pick best, by least squares."""
+    """Fit a rigid motion to corresponding points near the pick by least squares."""
     case = task.case
     if not isinstance(case.object_b, Mug):
         return None
@@ -161,7 +161,7 @@ def _oracle(task, *_) -> Attempt | None:
 
 
 def _descriptor_fields(task, model, encoded, key, num_starts, *, rigidly=False) -> Attempt:
-    """NDF: Adam optimises the pick alone."""
+    """Optimise the pick alone by Adam, as NDF does."""
     if num_starts not in encoded.picks:
         picked = Reference(
             encoded.reference.descriptors[:1],
@@ -188,7 +188,7 @@ def _replay(*arguments) -> Attempt:
 
 
 def _with_many(method: Callable) -> Callable:
-    """A method with `MANY` starts."""
+    """Run a method with `MANY` starts."""
     return lambda task, model, encoded, key, num_starts: method(task, model, encoded, key, MANY)
 
 
@@ -201,7 +201,7 @@ def _library(task, model, encoded, key, num_starts) -> Attempt:
 
 
 def _paper(energy: EnergyWeights) -> Callable:
-    """Eq. 3 over all waypoints, minimised by `solve`, which reaches lower energies than Adam from as many starts."""
+    """Minimise eq. 3 over all waypoints by `solve`, which reaches lower energies than Adam from as many starts."""
 
     def method(task, model, encoded, key, num_starts):
         goal, config = jnp.asarray(task.goal), SolveConfig(num_trajectory_starts=num_starts)
@@ -213,7 +213,7 @@ def _paper(energy: EnergyWeights) -> Callable:
 
 
 def _about_carried(energy: EnergyWeights) -> Callable:
-    """Eq. 3 whose correlation term compares with the demonstration as the library warps it.
+    """Minimise eq. 3 with a correlation term that compares with the demonstration as the library warps it.
 
     The descriptor term still acts on every waypoint.
     """
@@ -233,7 +233,7 @@ def _about_carried(energy: EnergyWeights) -> Callable:
 
 
 def _compensated(task, model, encoded, key, num_starts) -> Attempt:
-    """Eq. 6 couples the waypoints, so Adam minimises it."""
+    """Minimise eq. 6 by Adam, because it couples the waypoints."""
     goal, config = jnp.asarray(task.goal), OptimizeConfig(num_starts=num_starts)
     return _timed(
         encoded, lambda: optimize(encoded.field, encoded.reference, key, goal=goal, energy=COMPENSATOR, config=config)

@@ -32,7 +32,7 @@ LISTED = 12  # number of failures that the page lists
 
 
 def page(scores: Sequence[Score], model: Model, settings: Mapping[str, Any], extras: Mapping[str, Any]) -> str:
-    """The page.
+    """Render the page.
 
     Args:
         scores: scores of all methods on all tasks.

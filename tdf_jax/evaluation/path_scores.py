@@ -45,7 +45,7 @@ def run(
         progress: show a progress bar.
 
     Yields:
-        Task, name of the method, attempt. Methods that cannot run on a task are left out; variants run on every fifth
+        Task, name of the method, attempt. Methods that cannot run on a task are skipped; variants run on every fifth
         task only.
 
     Raises:
@@ -72,7 +72,7 @@ def run(
 
 
 def _attempt(arrays) -> Attempt | None:
-    """The attempt that arrays hold; there are none of a method that cannot run on the task."""
+    """Build an attempt from stored arrays, which are empty if the method cannot run on the task."""
     if not arrays:
         return None
     return Attempt(arrays["trajectories"], arrays["scores"], float(arrays["seconds"]), float(arrays["residual"]))

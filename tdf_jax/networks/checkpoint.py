@@ -173,7 +173,7 @@ def _sizes(header: Mapping) -> Mapping:
 
 
 def _record(kind: type, values: Mapping):
-    """A dataclass from JSON values, each of its field's type; an integer may stand for a float."""
+    """Build a dataclass from JSON values; check the type of each. An integer may stand for a float."""
     try:
         record = kind(**values)
     except TypeError as error:

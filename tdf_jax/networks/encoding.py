@@ -116,7 +116,7 @@ def _average(params, config, clouds, anchor):
 def consistent_latents(
     latents: Float[Array, "subsamples latent 3"], used: Bool[Array, " subsamples"]
 ) -> Bool[Array, " subsamples"]:
-    """Which latents of one symmetric object show it in the same of its equivalent poses.
+    """Select latents that agree on one of the equivalent poses of a symmetric object.
 
     A symmetric object looks the same in several poses. Each subsample of it looks slightly more like one of these poses
     than like the others, and the network decides for that one: the two sides of a flat bottle change places, a round
@@ -149,7 +149,7 @@ def consistent_latents(
 
 
 def _latent(params, config, points, anchor, used=None):
-    """Latent and origin of a cloud, or of its used points, displaced away from `anchor` (world frame)."""
+    """Encode a cloud, or its used points, displaced away from `anchor` (world frame); return latent and origin."""
     origin = jnp.mean(points, axis=0, where=None if used is None else used[:, None])
     # A cloud that was centred in float32 keeps a mean of about 1e-9 m, and centring it again in float64 moves the
     # latent by 1e-6 of its length. Such a cloud counts as centred, so that parity with the original network, which

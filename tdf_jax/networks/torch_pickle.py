@@ -136,15 +136,15 @@ def _run(pickled: bytes) -> object:
                 _expect(stack[-1], dict)
             case _:
                 asked = f"INST {str(argument).replace(' ', '.', 1)}" if opcode.name == "INST" else opcode.name
-                raise Refusal(f"its pickle asks for {asked}, an instruction that no state_dict needs")
+                raise Refusal(f"its pickle references {asked}, an instruction that no state_dict needs")
     raise ValueError("no STOP")
 
 
 def _global(name: str) -> _Global:
     if name not in STORAGES and name not in CONSTRUCTORS:
         raise Refusal(
-            f"it asks for {name}, and a checkpoint may only ask for tensors. If you trust the file, load it in PyTorch"
-            " and save model.state_dict() alone"
+            f"it references {name}, and a checkpoint may only reference tensors. If you trust the file, load it in "
+            "PyTorch and save model.state_dict() alone"
         )
     return _Global(name)
 

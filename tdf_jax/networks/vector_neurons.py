@@ -129,8 +129,7 @@ class EdgeConvolution(nn.Module):
             vector_dot(spread, spread),
             vector_dot(cross, cross),
         )
-        # The four terms are written out because a matrix product is not fused with what follows: 5 ms for 1500 points
-        # instead of 16.
+        # The four terms are written out because a matrix product would not be fused with the operations that follow.
         inner, squared = (
             sum(product[:, :, None] * weight for product, weight in zip(products, _bilinear(kernel, direction)))
             for kernel in (feature, direction)
@@ -174,7 +173,7 @@ def nearest_neighbours(points: Float[Array, "points 3"], count: int, used: Bool[
         squared = squared if used is None else jnp.where(used, squared, jnp.inf)
         return jax.lax.top_k(-squared, count)[1]
 
-    # Blocks bound the memory: all distances at once need 6 GB at 40,000 points.
+    # Blocks bound the memory, which is quadratic in the number of points if all distances exist at once.
     return jax.lax.map(nearest, points, batch_size=NEIGHBOUR_ROWS)
 
 

@@ -31,13 +31,13 @@ class Store:
         self._about = [FORMAT, version("tdf_jax"), fingerprint(model)]
 
     def run(self, setting: Setting) -> Run:
-        """The run of a setting."""
+        """Load or compute the run of a setting."""
         return self._kept(
             ["run", setting], lambda: dataclasses.asdict(imitation(self.model, setting)), lambda arrays: Run(**arrays)
         )
 
     def landscapes(self, base: Setting, field: str, count: int) -> dict[str, Swept]:
-        """The panels of one field in figure 2, see `tdf_jax.paper.energy_maps.figure2`."""
+        """Load or compute the panels of one field in figure 2, see `tdf_jax.paper.energy_maps.figure2`."""
 
         def swept():
             panels = figure2(self.model, base, field, count)

@@ -5,6 +5,6 @@ Modules:
     gauss_newton: damped Gauss-Newton steps on single poses
     initial: random or given starts, and the goal
     multistart: `solve`: Gauss-Newton from many starts in stages
-    pick: `carry`: the pick found, the demonstration warped from there to the goal
-    result: what a solver returns
+    pick: `carry`: finds the pick and warps the demonstration from there to the goal
+    result: result of any solver
 """

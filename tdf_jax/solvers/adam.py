@@ -37,8 +37,8 @@ class OptimizeConfig:
     Attributes:
         num_starts: number of random starts, M in the paper.
         iterations: number of Adam steps; the paper takes 100.
-        rotation_rate: first step size of Adam for rotations, radians. The nearest of 10 uniform rotations is 62 degrees
-            from a target on average, which 100 steps of NDF's 0.01 would not reach.
+        rotation_rate: first step size of Adam for rotations, radians. With NDF's 0.01 and 100 steps, most starts would
+            end before they reach the target (docs/results/code_notes.md#solversadam).
         translation_rate: first step size of Adam for translations, metres.
         final_rate: ratio of the last step size to the first; the rates decay as a cosine.
         start: distribution of the starts. "carried" rotates the whole demonstrated trajectory about the object's
@@ -117,7 +117,7 @@ def optimize(
 
     Raises:
         InputError: starts, goal, weights or device mesh of a wrong shape, type or value, a reference from another
-            network than the field, or one pose that is kept, so that nothing can move.
+            network than the field, or a single pose that is fixed.
     """
     checked, energy = prepare(
         "optimize()", field, reference, key, goal, fix_last, energy, config, starts, device_mesh, config.num_starts
@@ -139,7 +139,7 @@ def optimize(
         if progress is not None:
             progress(done + steps, devices.gathered(block)[:num_starts, steps - 1])
     trajectories = _trajectories(state, initial, reference.query, fix_last=fix_last)
-    # One more step, not kept: the energies after the last one, by the program that is compiled already.
+    # An extra step evaluates the final energies; its update is discarded.
     _, block = program(state, initial, field, reference, energy, rates, 1)
     history = jnp.concatenate(losses, axis=1)
     result = Result(trajectories, block[:, 0], history, initial, history)
@@ -240,7 +240,7 @@ def _evaluator(starts, field, reference, energy, fix_last, chunk):
     def evaluate(variables):
         indices = jnp.tile(jnp.arange(free), num_starts)
         inputs = (jax.tree.map(flat, variables), flat(start_rotations), indices)
-        # One pose at a time is mapped plainly: a batch of one took 15 ms a pose of 500 query points instead of 8.5.
+        # Single poses are mapped without a batch axis, because a batch of one is slower.
         losses, gradient = jax.lax.map(indexed, inputs, batch_size=chunk if chunk > 1 else None)
         remaining, remaining_gradient = jax.vmap(jax.value_and_grad(rest))(variables, start_rotations)
         mask = (jnp.arange(n) < free)[:, None]

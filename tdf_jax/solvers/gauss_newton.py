@@ -121,7 +121,7 @@ def _steps(R, centroid, waypoint, bounds, damping, tolerance, field, problem, en
     """`descend` on one device; `axes` names the axes of the device mesh."""
     if axes:
         parts, part = jax.lax.axis_size(axes), jax.lax.axis_index(axes)
-        # of the poses dealt out, those of this device
+        # Poses assigned to this device.
         bounds = bounds.at[:2].set((bounds[:2] - part + parts - 1) // parts)
     moving, _, _, steps = bounds
     moves = jnp.arange(len(R)) < moving
@@ -130,7 +130,7 @@ def _steps(R, centroid, waypoint, bounds, damping, tolerance, field, problem, en
         i, state, damping, step, _, history = carry
         R, centroid = se3.multiply(se3.exp(step[:, :3]), state.R), state.centroid + step[:, 3:]
         trial = _State(R, centroid, *_evaluate(R, centroid, waypoint, bounds, field, problem, energy, chunk))
-        # The first time nothing has moved and the state's energies are infinite: it takes what is finite.
+        # Energies of the initial state are infinite, so the first step accepts every finite energy.
         better = trial.energy < state.energy
         state = jax.tree.map(lambda a, b: jnp.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b), trial, state)
         factor = jnp.where(i == 0, 1.0, jnp.where(better, ACCEPTED, REJECTED))
@@ -206,7 +206,7 @@ def _evaluate(R, centroid, waypoint, bounds, field, problem, energy, chunk):
     return jax.tree.map(jnp.add, values, prior(R, centroid, problem.target[waypoint]))
 
 
-def _match(R, centroid, field, query, weights, shown):
+def _match(R, centroid, field, query, weights, demonstrated):
     """Weighted sum over query points of the mean absolute difference of descriptors, its gradient and its curvature."""
     arm = se3.rotate(R, query)
     x = (arm + centroid[:, None]).reshape(-1, 3)
@@ -216,7 +216,7 @@ def _match(R, centroid, field, query, weights, shown):
 
     # (points, channels), (points, 3, channels)
     found, tangents = jax.vmap(along, out_axes=(None, 1))(jnp.eye(3, dtype=x.dtype))
-    residual = found - shown.reshape(found.shape)
+    residual = found - demonstrated.reshape(found.shape)
     size = jnp.abs(residual)
     mean = jnp.mean(size, axis=-1)
     weights = jnp.tile(weights, len(R))

@@ -133,7 +133,7 @@ def _start(key, origin, reference, start, radius):
     if start == "carried":
         rotation = se3.uniform_rotations(rotation_key, 1)[0].astype(dtype)
         return reference.trajectory.transformed(se3.pose(rotation, origin)).wxyz_xyz
-    # Uniform in the ball; `jax.random.ball` takes 2 s to compile.
+    # The offset is uniform in the ball. `jax.random.ball` would be slow to compile.
     direction = jax.random.normal(direction_key, (n, 3), dtype)
     distance = radius * jnp.cbrt(jax.random.uniform(distance_key, (n, 1), dtype))
     offset = distance * direction / jnp.linalg.norm(direction, axis=-1, keepdims=True)

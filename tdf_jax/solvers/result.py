@@ -36,7 +36,7 @@ def _unknown() -> np.ndarray:
 )
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
 class Result:
-    """What a solver returns, whichever it is. Every field is an array; what is unknown is NaN.
+    """Result of any solver. Every field is an array; unknown values are NaN.
 
     `optimize` keeps every start to the end, so its candidates are its starts. `solve` and `carry` follow many starts on
     a few query points, drop most of them, and refine the best distinct candidates on all query points.
@@ -52,8 +52,8 @@ class Result:
         initial_trajectories: initial poses of every start, (starts, poses, 7), T_world_query.
         history: energy of every start before each step, (starts, steps); NaN where the solver does not follow the
             start. Of several waypoints `solve` follows the starts as trajectories in the search stage only.
-        residual: what the best pick of `carry` leaves unmatched of the demonstration's descriptors, see
-            `tdf_jax.confidence`; a scalar, NaN of other solvers.
+        residual: normalised descriptor energy of the best pick of `carry`, see `tdf_jax.confidence`; a scalar, NaN for
+            other solvers.
         confidence: probability that the pick is right, in [0, 1], see `tdf_jax.confidence`; a scalar, set by `imitate`
             with weights that it is calibrated for.
         recognised: probability that the object is of the demonstration's category, in [0, 1], see
@@ -141,7 +141,7 @@ class Result:
             return shapes
         starts, candidates = len(self.history), len(self.energies)
         rows = {
-            "starts": f"{starts}" + (f", {candidates} candidates kept" if self._pruned else ""),
+            "starts": f"{starts}" + (f", {candidates} final candidates" if self._pruned else ""),
             "poses": f"{np.shape(self.trajectories)[-2]}",
             "status": self.status,
         }

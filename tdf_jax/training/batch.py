@@ -58,7 +58,7 @@ class Batch:
         centres: origins of the objects' frames, (pairs, 2, 3), metres.
         fold: symmetry of the objects, (pairs, 2), see `tdf_jax.geometry.symmetry`; it determines which axes of the
             frame exist.
-        shown: query points at a place of each object, (pairs, 2, box, 3), metres.
+        demonstrated: query points at a place of each object, (pairs, 2, box, 3), metres.
         offered: the same query points on the other object of the pair, (pairs, 2, offers, box, 3), metres: first at the
             `QUARTERS` right poses, which are equivalent by the object's symmetry and may coincide, then at wrong poses.
     """
@@ -68,7 +68,7 @@ class Batch:
     inside: Float[np.ndarray, "pairs 2 queries"]
     centres: Float[np.ndarray, "pairs 2 3"]
     fold: Float[np.ndarray, "pairs 2"]
-    shown: Float[np.ndarray, "pairs 2 box 3"]
+    demonstrated: Float[np.ndarray, "pairs 2 box 3"]
     offered: Float[np.ndarray, "pairs 2 offers box 3"]
 
 
@@ -185,8 +185,8 @@ def _sample(data, index, cloud, chosen, size):
 
 
 def _pair(rng, samples, diagonal, box, num_poses):
-    """The fields of `Batch`: two samples of one kind, query points at a place of each, and these on the other one."""
-    shown, offered = [], []
+    """Fill the fields of `Batch` from two samples of one kind: query points at a place of each and on the other one."""
+    demonstrated, offered = [], []
     for a, b in (samples, samples[::-1]):
         place = 0 if rng.uniform() < FIRST_SHARE else rng.integers(1, len(a.places))
         x = rng.uniform(-0.5, 0.5, (box, 3)) * rng.uniform(*BOX_SIDES) * diagonal
@@ -194,7 +194,7 @@ def _pair(rng, samples, diagonal, box, num_poses):
         T_place_query[:3, :3] = Rotation.random(None, rng).as_matrix()
         if rng.uniform() < REMOTE_SHARE:
             T_place_query[:3, 3] = _direction(rng) * _log_uniform(rng, REMOTE_DISTANCES) * diagonal
-        shown.append(_apply(a.places[place] @ T_place_query, x))
+        demonstrated.append(_apply(a.places[place] @ T_place_query, x))
         right = b.places[place] @ T_place_query
         wrong = [_unlike(rng, right, diagonal, x, b) for _ in range(num_poses - 1)]
         offered.append([_apply(T, x) for T in (*_equals(right, b), *wrong)])
@@ -202,22 +202,22 @@ def _pair(rng, samples, diagonal, box, num_poses):
         np.stack([getattr(sample, name) for sample in samples])
         for name in ("cloud", "queries", "inside", "centre", "fold")
     )
-    return *fields, shown, offered
+    return *fields, demonstrated, offered
 
 
 def _equals(right, target):
-    """The right pose after every quarter turn about the target's axis that its symmetry allows; otherwise unchanged."""
+    """Rotate the right pose about the target's axis by multiples of 90 degrees that the symmetry allows, else by 0."""
     T_mean_object = np.eye(4)
     T_mean_object[:3, 3] = target.centre
-    turned = [
+    rotated = [
         T_mean_object @ about_z(quarter * np.pi / 2) @ np.linalg.inv(T_mean_object) @ right
         for quarter in range(QUARTERS)
     ]
-    return [turned[quarter if quarter * target.fold % QUARTERS == 0 else 0] for quarter in range(QUARTERS)]
+    return [rotated[quarter if quarter * target.fold % QUARTERS == 0 else 0] for quarter in range(QUARTERS)]
 
 
 def _unlike(rng, right, diagonal, x, target):
-    """A wrong pose that is not equivalent to the right one: a rotation of a round bowl about its axis would be."""
+    """Draw a wrong pose that is not equivalent to the right one, as a round bowl's rotation about its axis would be."""
     while True:
         wrong = _wrong(rng, right, diagonal)
         if target.fold == 1:
@@ -229,7 +229,7 @@ def _unlike(rng, right, diagonal, x, target):
 
 
 def _wrong(rng, right, diagonal):
-    """A pose that differs from the right one by a rotation about the query frame's origin and a translation."""
+    """Draw a pose that differs from the right one by a rotation about the query frame's origin and a translation."""
     wrong = right.copy()
     if rng.uniform() < GLOBAL_SHARE:
         wrong[:3, :3] = Rotation.random(None, rng).as_matrix()

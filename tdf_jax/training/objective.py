@@ -29,7 +29,7 @@ def pair_loss(
     inside: Float[Array, "2 queries"],
     centres: Float[Array, "2 3"],
     fold: Float[Array, "2"],
-    shown: Float[Array, "2 box 3"],
+    demonstrated: Float[Array, "2 box 3"],
     offered: Float[Array, "2 offers box 3"],
 ) -> tuple[Float[Array, ""], dict]:
     """Loss of a pair of objects: occupancy, `FRAME_WEIGHT` times the frame error, `PLACE_WEIGHT` times the place error.
@@ -42,7 +42,7 @@ def pair_loss(
         inside: 1 inside the object, 0 outside, (2, queries).
         centres: origins of the objects' frames, (2, 3), metres, relative to the clouds' means.
         fold: symmetry of the objects, (2,), see `tdf_jax.geometry.symmetry`.
-        shown: query points at a place of each object, (2, box, 3); see `tdf_jax.training.batch.Batch`.
+        demonstrated: query points at a place of each object, (2, box, 3); see `tdf_jax.training.batch.Batch`.
         offered: the same query points on the other object, (2, offers, box, 3).
 
     Returns:
@@ -52,7 +52,7 @@ def pair_loss(
         functools.partial(_object_loss, params, config), clouds, queries, inside, centres, fold
     )
     others = jax.tree.map(lambda leaf: leaf[::-1], fields)
-    place = _each(place_error, fields, others, shown, offered)
+    place = _each(place_error, fields, others, demonstrated, offered)
     return jnp.mean(losses) + PLACE_WEIGHT * jnp.mean(place), parts | {"place": place}
 
 
@@ -108,9 +108,9 @@ def frame_error(
 
 
 def place_error(
-    shown_on: DescriptorField,
+    demonstrated_on: DescriptorField,
     offered_to: DescriptorField,
-    shown: Float[Array, "box 3"],
+    demonstrated: Float[Array, "box 3"],
     offered: Float[Array, "offers box 3"],
 ) -> Float[Array, ""]:
     """Negative log probability of the right pose of another object's place, by the energies of candidate poses.
@@ -120,7 +120,7 @@ def place_error(
     not depend on the unit of the energy. A symmetric object has several right poses, and its network takes one of its
     fronts for the front; the right pose of the least energy counts.
     """
-    reference = shown_on.descriptors(shown)
+    reference = demonstrated_on.descriptors(demonstrated)
     energy = jnp.mean(jnp.abs(offered_to.descriptors(offered) - reference), axis=(1, 2))
     energy = jnp.concatenate([jnp.min(energy[:QUARTERS], keepdims=True), energy[QUARTERS:]])
     return optax.softmax_cross_entropy_with_integer_labels(-SHARPNESS * jnp.log(energy), jnp.int32(0))

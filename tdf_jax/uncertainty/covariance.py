@@ -148,8 +148,9 @@ def pose_covariance(
     The energy is a mean of absolute values: it has kinks, and near a perfect match it is a cone. Second derivatives say
     little about it, so the curvature is a secant, fitted to rises of the energy. Each rise is the mean over a step and
     its opposite, which cancels the slope at the pose. The steps follow six axes and the diagonals of their pairs. The
-    axes are those of the ellipsoid of the previous pass. The steps are as long as it takes to raise the energy by
-    `scale`, but at most 15 degrees times the rotation_scale.
+    axes are those of the ellipsoid of the previous pass. A step raises the energy by `scale`, as far as the curvature
+    predicts. It rotates by at most 0.26 rad (15 degrees) and translates by at most 0.26 rad times the rotation_scale,
+    in metres.
 
     The covariance says which directions are certain on one object. It does not include the difference of shape between
     two objects (docs/results/code_notes.md#uncertaintycovariance).

@@ -77,7 +77,7 @@ def reliability_figure(scores: Sequence[Score], bins: Sequence[Mapping]) -> Figu
     """The share of right picks against the confidence, and the number of picks of each confidence.
 
     Args:
-        scores: scores; those without a confidence are left out.
+        scores: scores; those without a confidence are excluded.
         bins: bins as `tdf_jax.uncertainty.calibration.bins` makes them.
     """
     confident = [one for one in scores if one.confidence is not None]

@@ -239,22 +239,22 @@ def test_code_is_refused_by_name_and_not_run(tmp_path, function, protocol):
     for content in contents:
         message = refusal(write_zip(tmp_path / "a.pth", pickle.dumps(content, protocol)))
         module = "__builtin__" if protocol < 3 and function.__module__ == "builtins" else function.__module__
-        assert f"asks for {module}.{function.__name__}," in message
+        assert f"references {module}.{function.__name__}," in message
     assert marker.exists()
 
 
 @pytest.mark.parametrize(
     ("body", "reason"),
     [
-        (called(named("os", "system"), text("true")), "asks for os.system"),
-        (called(named("torch.hub", "load"), text("repository")), "asks for torch.hub.load"),
-        (called(named("torch", "load"), text("file")), "asks for torch.load"),
-        (called(named("ndf_robot.model", "VNNOccNet")), "asks for ndf_robot.model.VNNOccNet"),
-        (b"\x8c\x0bcollections\x8c\x14OrderedDict.fromkeys\x93", "asks for collections.OrderedDict.fromkeys"),
-        (b"(" + text("true") + b"ios\nsystem\n", "asks for INST os.system"),
-        (named("collections", "OrderedDict") + b")\x81", "asks for NEWOBJ"),
-        (b"(" + named("collections", "OrderedDict") + b"o", "asks for OBJ"),
-        (b"\x82\x01", "asks for EXT1"),
+        (called(named("os", "system"), text("true")), "references os.system"),
+        (called(named("torch.hub", "load"), text("repository")), "references torch.hub.load"),
+        (called(named("torch", "load"), text("file")), "references torch.load"),
+        (called(named("ndf_robot.model", "VNNOccNet")), "references ndf_robot.model.VNNOccNet"),
+        (b"\x8c\x0bcollections\x8c\x14OrderedDict.fromkeys\x93", "references collections.OrderedDict.fromkeys"),
+        (b"(" + text("true") + b"ios\nsystem\n", "references INST os.system"),
+        (named("collections", "OrderedDict") + b")\x81", "references NEWOBJ"),
+        (b"(" + named("collections", "OrderedDict") + b"o", "references OBJ"),
+        (b"\x82\x01", "references EXT1"),
         # Allowed things put to other uses: attributes set on a class, a storage called, a string for a function.
         (named("collections", "OrderedDict") + b"}" + text("keys") + integer(1) + b"sb", "damaged"),
         (called(named("collections", "OrderedDict")) + b"N}" + text("a") + integer(1) + b"s\x86b", "damaged"),

@@ -84,7 +84,7 @@ def test_it_prints_a_summary():
     words = repr(result)
     x, y, z = (f"{value:.3f}" for value in result.trajectories[1, 0, 4:])
     assert f"xyz ({x}, {y}, {z}) m" in words
-    assert "0.10000 (others: 0.20000, 0.30000)" in words and "6, 3 candidates kept" in words
+    assert "0.10000 (others: 0.20000, 0.30000)" in words and "6, 3 final candidates" in words
     assert "0.93 that the pick is right" in words and "recognised  unknown" in words
     modes = tdf.cluster_poses(result.trajectories[:, 0], result.energies)
     assert f"{len(modes)} distinct picks" in words

@@ -92,10 +92,10 @@ def rigid(x, y):
 
 
 def test_the_right_pose_is_the_same_place_of_the_partner_and_the_others_are_not(objects):
-    """The shown box and the first offered box are rigid copies from place to place; positions identify the places."""
+    """The demonstrated and first offered box are rigid copies from place to place; positions identify the places."""
     for sample, partner in pairs_of(drawn(objects, 2, pairs=8)):
         (index, size), (other, other_size) = source(objects, sample), source(objects, partner)
-        T, left = rigid(sample["shown"], sample["offered"][0])
+        T, left = rigid(sample["demonstrated"], sample["offered"][0])
         assert left < 1e-5
         expected = []
         for place, other_place in zip(objects.places[index].copy(), objects.places[other].copy()):
@@ -106,7 +106,7 @@ def test_the_right_pose_is_the_same_place_of_the_partner_and_the_others_are_not(
         for equal in sample["offered"][1 : batch.QUARTERS]:  # of an object without symmetry there is one right pose
             np.testing.assert_array_equal(equal, sample["offered"][0])
         for wrong in sample["offered"][batch.QUARTERS :]:
-            assert rigid(sample["shown"], wrong)[1] < 1e-5
+            assert rigid(sample["demonstrated"], wrong)[1] < 1e-5
             moved = np.linalg.norm(wrong - sample["offered"][0], axis=-1).max()
             assert moved > 0.003 * size
 
