@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from tdf_jax._internal.errors import InputError
 
+SEEDS = 2**32  # jax truncates a larger seed to 32 bits without a warning
 MINIMUM_POINTS = 21  # the encoder's 20 nearest neighbours, the point itself included, and one to choose from
 
 
@@ -24,26 +25,48 @@ def traced(*values) -> bool:
 
 
 def count(function: str, name: str, value, least: int = 1, most: float = np.inf) -> int:
-    """A whole number of at least `least`, and at most `most`."""
-    if not isinstance(value, int | np.integer) or isinstance(value, bool) or not least <= value <= most:
+    """Check that a value is a whole number from `least` to `most`; return it."""
+    if not _is_whole(value) or not least <= value <= most:
         expected = f"of at least {least}" if most == np.inf else f"from {least} to {most}"
         raise InputError(f"{function}: {name} is {value!r}; expected a whole number {expected}")
     return int(value)
 
 
-def number(function: str, name: str, value, least: float = -np.inf, most: float = np.inf, unit: str = ""):
-    """One finite number between `least` and `most`, ends included."""
+def counts(function: str, name: str, value, size: int = 3) -> tuple[int, ...]:
+    """Check that a value is `size` whole numbers of at least 1; return them."""
+    if np.shape(value) != (size,) or not all(_is_whole(n) and n >= 1 for n in value):
+        raise InputError(f"{function}: {name} is {value}; expected {_in_words(size)} whole numbers of at least 1")
+    return tuple(int(n) for n in value)
+
+
+def seed(function: str, value, name: str = "seed") -> int:
+    """Check that a value is a whole number that jax takes as a seed; return it."""
+    return count(function, name, value, 0, SEEDS - 1)
+
+
+def number(
+    function: str,
+    name: str,
+    value,
+    least: float = -np.inf,
+    most: float = np.inf,
+    unit: str = "",
+    *,
+    below: float = np.inf,
+):
+    """Check that a value is one finite number from `least` to `most` and less than `below`; return it."""
     if traced(value):
         return _scalar(function, name, value)
-    if not _is_number(value) or not least <= value <= most:
+    if not _is_number(value) or not least <= value <= most or not value < below:
         above = f" of {least:g} or more" if np.isfinite(least) else ""
         expected = f" from {least:g} to {most:g}" if np.isfinite(most) else above
+        expected += f", less than {below:g}" if np.isfinite(below) else ""
         raise InputError(f"{function}: {name} is {value!r}; expected one finite number{expected}{unit and ', ' + unit}")
     return value
 
 
 def positive(function: str, name: str, value, unit: str = ""):
-    """One finite number above 0."""
+    """Check that a value is one finite number above 0; return it."""
     if traced(value):
         return _scalar(function, name, value)
     if not _is_number(value) or not value > 0:
@@ -51,15 +74,15 @@ def positive(function: str, name: str, value, unit: str = ""):
     return value
 
 
-def choice(function: str, name: str, value, choices: Collection[str]) -> str:
-    """One of the choices."""
-    if not isinstance(value, str) or value not in choices:
-        raise InputError(f"{function}: {name} is {value!r}; expected one of {', '.join(choices)}")
+def choice(function: str, name: str, value, choices: Collection[str] | Collection[int]):
+    """Check that a value is one of the choices, which are words or whole numbers; return it."""
+    if not (isinstance(value, str) or _is_whole(value)) or value not in choices:
+        raise InputError(f"{function}: {name} is {value!r}; expected one of {', '.join(map(str, choices))}")
     return value
 
 
 def vector(function: str, name: str, value: ArrayLike, size: int = 3, unit: str = "metres") -> np.ndarray | jax.Array:
-    """`size` finite numbers, as float64 unless they are traced."""
+    """Check that a value is `size` finite numbers; return them, as float64 unless they are traced."""
     vector = jnp.asarray(value) if traced(value) else _array(function, name, value)
     if vector.shape != (size,) or not (traced(vector) or np.isfinite(vector).all()):
         raise InputError(
@@ -69,7 +92,7 @@ def vector(function: str, name: str, value: ArrayLike, size: int = 3, unit: str 
 
 
 def direction(function: str, name: str, value: ArrayLike) -> np.ndarray | jax.Array:
-    """Three finite numbers that are not all zero, of any length; as float64 unless they are traced."""
+    """Check that a value is a vector other than zero, (3,); return it, as float64 unless it is traced."""
     direction = vector(function, name, value, unit="")
     if not traced(direction) and not direction.any():
         raise InputError(f"{function}: {name} is zero; expected a direction, three numbers that are not all zero")
@@ -77,17 +100,27 @@ def direction(function: str, name: str, value: ArrayLike) -> np.ndarray | jax.Ar
 
 
 def lengths(function: str, name: str, value: ArrayLike, size: int = 3) -> np.ndarray | jax.Array:
-    """`size` finite numbers above 0, metres, as float64 unless they are traced."""
+    """Check that a value is `size` lengths above 0, metres; return them, as float64 unless they are traced."""
     lengths = jnp.asarray(value) if traced(value) else _array(function, name, value)
     if lengths.shape != (size,) or not (traced(lengths) or (np.isfinite(lengths) & (lengths > 0)).all()):
         raise InputError(f"{function}: {name} is {value}; expected {_in_words(size)} lengths above 0, metres")
     return lengths
 
 
-def coordinates(function: str, name: str, value: ArrayLike, rows: str = "points") -> np.ndarray | jax.Array:
-    """Points in space, (rows, 3), at least one, finite; as an array of the caller's type."""
+def positions(function: str, name: str, value: ArrayLike) -> jax.Array:
+    """Check that a value has the shape of points, (..., 3); return it as an array. Coordinates are not checked."""
+    array = jnp.asarray(value)
+    if array.shape[-1:] != (3,):
+        raise InputError(f"{function}: {name} has shape {array.shape}; expected (..., 3), metres")
+    return array
+
+
+def coordinates(
+    function: str, name: str, value: ArrayLike, rows: str = "points", least: int = 1
+) -> np.ndarray | jax.Array:
+    """Check that a value is finite points, (rows, 3), at least `least`; return an array of the caller's type."""
     array = jnp.asarray(value) if traced(value) else np.asarray(value)
-    if array.ndim != 2 or array.shape[1] != 3 or not len(array) or array.dtype.kind not in "fiu":
+    if array.ndim != 2 or array.shape[1] != 3 or len(array) < least or array.dtype.kind not in "fiu":
         raise InputError(f"{function}: {name} has shape {array.shape}; expected numbers ({rows}, 3), metres")
     if not traced(array) and not np.isfinite(array).all():
         raise InputError(f"{function}: {name} has NaN or infinite coordinates; expected finite metres")
@@ -95,7 +128,7 @@ def coordinates(function: str, name: str, value: ArrayLike, rows: str = "points"
 
 
 def pose(function: str, name: str, value: ArrayLike) -> ArrayLike:
-    """One finite pose `wxyz_xyz` whose quaternion is not zero; returned as it is."""
+    """Check that a value is one finite pose `wxyz_xyz` whose quaternion is not zero; return it."""
     if np.shape(value) != (7,):
         raise InputError(f"{function}: {name} has shape {np.shape(value)}; expected one pose wxyz_xyz, (7,)")
     if not traced(value):
@@ -108,7 +141,7 @@ def pose(function: str, name: str, value: ArrayLike) -> ArrayLike:
 
 
 def rotations(function: str, name: str, value: ArrayLike) -> ArrayLike:
-    """Rotation matrices (..., 3, 3); returned as they are."""
+    """Check that a value is rotation matrices, (..., 3, 3); return it."""
     if np.shape(value)[-2:] != (3, 3):
         raise InputError(f"{function}: {name} has shape {np.shape(value)}; expected rotation matrices, (..., 3, 3)")
     if not traced(value):
@@ -119,7 +152,7 @@ def rotations(function: str, name: str, value: ArrayLike) -> ArrayLike:
 
 
 def orientation(function: str, name: str, value: ArrayLike) -> np.ndarray | jax.Array:
-    """One rotation, as a matrix (3, 3) or a quaternion wxyz (4,) that is not zero; as float64 unless it is traced."""
+    """Check that a value is a matrix (3, 3) or a quaternion wxyz (4,); return it, as float64 unless it is traced."""
     orientation = jnp.asarray(value) if traced(value) else _array(function, name, value)
     if orientation.shape not in {(3, 3), (4,)}:
         raise InputError(f"{function}: {name} has shape {orientation.shape}; expected (3, 3), or (4,) as wxyz")
@@ -131,7 +164,7 @@ def orientation(function: str, name: str, value: ArrayLike) -> np.ndarray | jax.
 
 
 def key(function: str, value) -> jax.Array:
-    """One random key, of `jax.random.key` or the older `jax.random.PRNGKey`."""
+    """Check that a value is one key of `jax.random.key` or the older `jax.random.PRNGKey`; return it."""
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", np.dtype(object))
     if not (shape == () and jnp.issubdtype(dtype, jax.dtypes.prng_key)) and not (shape == (2,) and dtype == np.uint32):
         got = repr(value) if shape is None or shape == () else f"an array of shape {shape}"
@@ -140,7 +173,7 @@ def key(function: str, value) -> jax.Array:
 
 
 def points(function: str, value, name: str = "points"):
-    """A point cloud that can be encoded, (points, 3), metres; nothing is changed or dropped.
+    """Check that a value is a point cloud that can be encoded, (points, 3), metres; return all of its points.
 
     Args:
         function: begins the message.
@@ -186,7 +219,7 @@ def points(function: str, value, name: str = "points"):
 
 
 def query(function: str, value) -> ArrayLike:
-    """Query points (queries, 3), at least one, finite; returned as they are."""
+    """Check that a value is query points (queries, 3), at least one, finite; return it."""
     shape = np.shape(value)
     if len(shape) != 2 or shape[1] != 3 or shape[0] < 1:
         raise InputError(
@@ -199,6 +232,10 @@ def query(function: str, value) -> ArrayLike:
 
 def _in_words(size: int) -> str:
     return {3: "three", 4: "four", 7: "seven"}.get(size, str(size))
+
+
+def _is_whole(value) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
 def _is_number(value) -> bool:

@@ -153,6 +153,7 @@ def _folder(out: Path) -> Path:
 
 
 def _check(pairs, seed, height, clouds, methods, num_starts, meshes, num_poses, demonstrations) -> None:
+    from tdf_jax._internal import checks
     from tdf_jax._internal.errors import InputError
     from tdf_jax.evaluation.demonstration_count import MOST
     from tdf_jax.evaluation.path_methods import METHODS
@@ -165,10 +166,10 @@ def _check(pairs, seed, height, clouds, methods, num_starts, meshes, num_poses, 
         pairs >= 1 or (meshes is not None and pairs == 0),
         f"--pairs is {pairs}; expected at least 1, or 0 with --meshes",
     )
-    need(0 <= seed < 2**32, f"--seed is {seed}; expected 0 to {2**32 - 1}")
-    need(0.01 <= height <= 1.0, f"--height is {height}; expected metres between 0.01 and 1")
-    need(num_starts >= 1, f"--num-starts is {num_starts}; expected at least 1")
-    need(num_poses >= 1, f"--num-poses is {num_poses}; expected at least 1")
+    checks.seed("tdf benchmark", seed, "--seed")
+    checks.number("tdf benchmark", "--height", height, 0.01, 1, "metres")
+    checks.count("tdf benchmark", "--num-starts", num_starts)
+    checks.count("tdf benchmark", "--num-poses", num_poses)
     need(clouds, "--clouds is empty; expected at least one condition, such as full")
     unknown = [name for name in methods if name not in (*METHODS, "all")]
     need(
@@ -176,7 +177,5 @@ def _check(pairs, seed, height, clouds, methods, num_starts, meshes, num_poses, 
         f"--methods has {', '.join(map(repr, unknown)) or 'none'}; expected all, or some of "
         f"{', '.join(map(repr, METHODS))}",
     )
-    need(
-        all(1 <= count <= MOST for count in demonstrations),
-        f"--demonstrations is {demonstrations}; expected numbers of 1 to {MOST}",
-    )
+    for count in demonstrations:
+        checks.count("tdf benchmark", "--demonstrations", count, most=MOST)

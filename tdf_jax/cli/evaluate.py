@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 
 if TYPE_CHECKING:
@@ -116,7 +117,7 @@ def evaluate(
             outcomes[objects, condition] = compare(
                 cases, model, BASELINES if baselines else (), seed=seed, config=config
             )
-            if json is not None:  # after every condition, because all of them can take hours
+            if json is not None:  # the file is written after every condition, because all of them can take hours
                 write_record("tdf evaluate", json, pick_report.record(outcomes, settings, model))
     print(pick_report.table(outcomes, settings))
     sys.stdout.flush()
@@ -129,12 +130,10 @@ def evaluate(
 def _check_numbers(pairs, seed, size, clouds, meshes, num_poses) -> None:
     if pairs < 1 and (meshes is None or pairs < 0):
         raise InputError(f"tdf evaluate: --pairs is {pairs}; expected at least 1, or 0 with --meshes")
-    if num_poses < 1:
-        raise InputError(f"tdf evaluate: --num-poses is {num_poses}; expected at least 1")
-    if not 0 <= seed < 2**32:
-        raise InputError(f"tdf evaluate: --seed is {seed}; expected 0 to {2**32 - 1}")
-    if size is not None and not 0.01 <= size <= 1.0:
-        raise InputError(f"tdf evaluate: --size is {size}; expected metres between 0.01 and 1")
+    checks.count("tdf evaluate", "--num-poses", num_poses)
+    checks.seed("tdf evaluate", seed, "--seed")
+    if size is not None:
+        checks.number("tdf evaluate", "--size", size, 0.01, 1, "metres")
     if not clouds:
         raise InputError("tdf evaluate: --clouds is empty; expected at least one condition, such as full")
 

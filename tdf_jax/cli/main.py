@@ -10,6 +10,7 @@ import tyro
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.landscape.storage import DEPRECATED_REDUCTIONS
+from tdf_jax.paper.setting import DEPRECATED_FIELD_ENERGIES
 
 MEMORY = "error: out of memory; lower the number of starts, poses, query points or points, or raise the pitch"
 # each is a function in the module of its name
@@ -24,7 +25,10 @@ DEPRECATED_FLAGS = {
     "train": {"--poses": "--num-poses", "--network.asymmetry": "--network.symmetry-breaking-offset"},
 }
 # Choices of the release before by command and option; they are accepted for one release, with a warning.
-DEPRECATED_CHOICES = {"landscape": {"--reduce": DEPRECATED_REDUCTIONS}}
+DEPRECATED_CHOICES = {
+    "landscape": {"--reduce": DEPRECATED_REDUCTIONS},
+    "reproduce": {"--field-energy": DEPRECATED_FIELD_ENERGIES},
+}
 STYLE = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)  # `--json` without `--no-json`, no word for "not given"
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import tyro
 from jaxtyping import PRNGKeyArray
 
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.cases import QUERY_SIZE, Case, generated_case, place_demonstration, random_pose
 from tdf_jax.evaluation.scene import Scene
@@ -20,8 +21,6 @@ from tdf_jax.io.meshes import load_mesh
 from tdf_jax.io.pointclouds import load_points
 from tdf_jax.landscape.shortest_path import SHARPEST
 from tdf_jax.shapes import FAMILIES
-
-SEEDS = 2**32  # jax truncates a larger seed to 32 bits without a warning
 
 
 def _option(metavar: str | None = None, default: str | None = None):
@@ -190,8 +189,7 @@ def resolved(settings: AnySettings) -> AnySettings:
 
 
 def _check_numbers(settings: SceneSettings) -> None:
-    if not 0 <= settings.seed < SEEDS:
-        raise InputError(f"{settings.COMMAND}: --seed is {settings.seed}; expected 0 to {SEEDS - 1}")
+    checks.seed(settings.COMMAND, settings.seed, "--seed")
     if settings.target is None and settings.scale != 1:
         raise InputError(f"{settings.COMMAND}: --scale is for a --target file; give one, or drop --scale")
     if isinstance(settings, Settings):
@@ -200,34 +198,26 @@ def _check_numbers(settings: SceneSettings) -> None:
                 "tdf imitate: --k is a weight of eq. 3, which --method carry does not minimise; drop it, or add "
                 "--method gauss-newton or adam"
             )
-        if settings.num_starts is not None and settings.num_starts < 1:
-            raise InputError(f"tdf imitate: --num-starts is {settings.num_starts}; expected at least 1")
-        if settings.k is not None and not 0 <= settings.k < np.inf:
-            raise InputError(f"tdf imitate: --k is {settings.k}; expected a weight of 0 or more")
-        if not np.isfinite(settings.goal_offset).all():
-            raise InputError(
-                f"tdf imitate: --goal-offset is {settings.goal_offset}; expected three finite numbers, metres"
-            )
+        if settings.num_starts is not None:
+            checks.count("tdf imitate", "--num-starts", settings.num_starts)
+        if settings.k is not None:
+            checks.number("tdf imitate", "--k", settings.k, 0)
+        checks.vector("tdf imitate", "--goal-offset", settings.goal_offset)
     if isinstance(settings, LandscapeSettings):
         for name in ("half", "radius", "pitch"):
-            if not 0 < getattr(settings, name) < np.inf:
-                raise InputError(
-                    f"tdf landscape: --{name} is {getattr(settings, name)}; expected a length above 0, metres"
-                )
+            checks.positive("tdf landscape", f"--{name}", getattr(settings, name), "metres")
         if settings.grid != "path" and settings.half < settings.pitch / 2:
             raise InputError(
                 f"tdf landscape: --half is {settings.half}; expected at least half the pitch of {settings.pitch}: two "
                 "points a side"
             )
-        if not 0 <= settings.sharpness <= SHARPEST:
-            raise InputError(f"tdf landscape: --sharpness is {settings.sharpness}; expected 0 to {SHARPEST:g}")
+        checks.number("tdf landscape", "--sharpness", settings.sharpness, 0, SHARPEST)
         if settings.grid == "path" and settings.pitch > settings.radius:
             raise InputError(
                 f"tdf landscape: --pitch is {settings.pitch} and --radius {settings.radius}; expected a pitch of "
                 "at most the radius"
             )
-        if settings.rotations < 1:
-            raise InputError(f"tdf landscape: --rotations is {settings.rotations}; expected at least 1")
+        checks.count("tdf landscape", "--rotations", settings.rotations)
 
 
 def make_scene(settings: SceneSettings, key: PRNGKeyArray) -> Scene:

@@ -33,8 +33,7 @@ def shapes(
     from tdf_jax.viz.style import save_figure
 
     checks.count("tdf shapes", "--count", count)
-    if not 0 <= seed < 2**32:
-        raise InputError(f"tdf shapes: --seed is {seed}; expected 0 to {2**32 - 1}")
+    checks.seed("tdf shapes", seed, "--seed")
     if out.suffix != ".png" or not out.parent.is_dir():
         raise InputError(f"tdf shapes: --out is {out}; expected a .png in an existing folder")
     family = FAMILIES[category]

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from tdf_jax._internal.errors import InputError
+from tdf_jax._internal import checks
 from tdf_jax.evaluation.annotated_meshes import AnnotatedMesh
 from tdf_jax.evaluation.conditions import CONDITIONS, SCALES, observed
 from tdf_jax.geometry import se3
@@ -24,8 +24,8 @@ LIFT = (0.0, 0.0, 1.0)  # a semicircle and a wave leave the straight line upward
 # Evaluation objects are drawn from [SEED_SPACE, seed, index] and training objects from [seed, index], so no object is
 # in both.
 SEED_SPACE = 7_000_001
-# Folded into the key of random poses. Start m of a seed is drawn from fold_in(key(seed), m), and must not be the true
-# rotation.
+# This number is folded into the key of random poses. Start m of a seed is drawn from fold_in(key(seed), m), and must
+# not be the true rotation.
 POSE_STREAM = 0x7D05E
 
 
@@ -208,8 +208,7 @@ def place_demonstration(
 
 
 def _scale(function: str, clouds: str) -> float:
-    if clouds not in CONDITIONS:
-        raise InputError(f"{function}(): clouds is {clouds!r}; expected one of {', '.join(CONDITIONS)}")
+    checks.choice(f"{function}()", "clouds", clouds, CONDITIONS)
     return SCALES.get(clouds, 1.0)
 
 
@@ -225,8 +224,7 @@ def _case(
 ) -> Case:
     places = FAMILIES[a.category].places
     place = places[0] if place is None else place
-    if place not in places:
-        raise InputError(f"generated_case(): place is {place!r}; expected one of a {a.category}'s: {', '.join(places)}")
+    checks.choice("generated_case()", f"place of a {a.category}", place, places)
     rng = np.random.default_rng([SEED_SPACE, seed, number, 1])
     cloud_a, cloud_b = (sample_surface(one.mesh, points, rng) for one in (a, b))
     # All conditions share this random stream, so that they differ by the condition and not by chance.

@@ -12,7 +12,6 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from numpy.typing import ArrayLike
 
 from tdf_jax._internal import checks
-from tdf_jax._internal.errors import InputError
 
 
 def box_query(
@@ -122,10 +121,9 @@ def lattice_query(
     Raises:
         InputError: shape is not three whole numbers of at least 1, or pitch is not above 0.
     """
-    if np.shape(shape) != (3,) or not all(isinstance(n, int | np.integer) and n >= 1 for n in shape):
-        raise InputError(f"lattice_query(): shape is {shape}; expected three whole numbers of at least 1")
+    numbers = checks.counts("lattice_query()", "shape", shape)
     checks.positive("lattice_query()", "pitch", pitch, "metres")
-    steps = [pitch * (np.arange(n) - (n - 1) / 2) for n in shape]
+    steps = [pitch * (np.arange(n) - (n - 1) / 2) for n in numbers]
     points = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
     return jnp.asarray(checks.vector("lattice_query()", "centre", centre)) + jnp.asarray(points)
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from tdf_jax._internal.errors import InputError
+from tdf_jax._internal import checks
 from tdf_jax.networks.occupancy import NORM_FLOOR, Conditioned, decode
 
 
@@ -50,7 +50,5 @@ class DescriptorField:
         return jax.nn.sigmoid(self._decode("occupancy", x)[1])
 
     def _decode(self, function, x):
-        x = jnp.asarray(x)
-        if x.shape[-1:] != (3,):
-            raise InputError(f"DescriptorField.{function}(): x has shape {x.shape}; expected (..., 3), metres")
+        x = checks.positions(f"DescriptorField.{function}()", "x", x)
         return decode(self.conditioned, x - self.origin)

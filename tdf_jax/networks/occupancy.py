@@ -26,7 +26,6 @@ from jaxtyping import Array, Bool, Float
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.deprecation import renamed_fields
-from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.precision import full_precision
 from tdf_jax.networks.vector_neurons import (
     EdgeConvolution,
@@ -80,9 +79,7 @@ class NetworkConfig:
         checks.number("NetworkConfig()", "slope", self.slope)
         checks.positive("NetworkConfig()", "scaling", self.scaling)
         offset = self.symmetry_breaking_offset
-        checks.number("NetworkConfig()", "symmetry_breaking_offset", offset, 0)
-        if offset >= 1:
-            raise InputError(f"NetworkConfig(): symmetry_breaking_offset is {offset}; expected 0 to less than 1")
+        checks.number("NetworkConfig()", "symmetry_breaking_offset", offset, 0, below=1)
 
     @property
     def channels(self) -> int:

@@ -8,8 +8,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from tdf_jax._internal.deprecation import renamed_fields
-from tdf_jax._internal.errors import InputError
+from tdf_jax._internal import checks
+from tdf_jax._internal.deprecation import renamed_fields, warn
 from tdf_jax.energy.losses import COMPENSATOR_ORDERS, POSE_NORMS, EnergyWeights
 from tdf_jax.energy.reference import Reference
 from tdf_jax.evaluation.cases import mug_of
@@ -26,11 +26,12 @@ from tdf_jax.solvers.initial import STARTS, default_goal
 
 QUERIES = ("box", "gaussian")
 CORRELATED = ("demonstration", "stretched")
-FIELD_ENERGIES = ("least", "mean")
-SEEDS = 2**32  # jax takes no larger seed
-END = (0.0, 0.83, 0.0)  # from the first pose to the last, in the paper's unit: figure 2 marks (0, 0) and (0, 0.83)
-POINTS = 1500  # of a cloud, before `describe` and `imitate` subsample it
-STREAM = 0x7AB1E1  # folded into all random draws of a setting
+FIELD_ENERGIES = ("min", "mean")
+# Choices of the release before; they are accepted for one release, with a warning.
+DEPRECATED_FIELD_ENERGIES = {"least": "min"}
+END = (0.0, 0.83, 0.0)  # vector between first and last pose, paper's unit; figure 2 marks (0, 0) and (0, 0.83)
+POINTS = 1500  # number of points of a cloud, before `describe` and `imitate` subsample it
+STREAM = 0x7AB1E1  # number that is folded into all random keys of a setting
 
 
 @renamed_fields(poses="num_poses", inits="num_starts", lever="rotation_scale")
@@ -69,7 +70,7 @@ class Setting:
         diagonal: diagonal of both mugs, metres.
         unit: the paper's unit, metres.
         turn: rotation of the test mug about a random axis, degrees; "any" is a uniform rotation.
-        field_energy: E(x) of figure 2: the lowest of the energies of the waypoints at x, or their mean.
+        field_energy: E(x) of figure 2: the minimum of the energies of the waypoints at x, or their mean.
         seed: seed of the mugs, the axis, the clouds, the query points and the starts.
     """
 
@@ -95,32 +96,30 @@ class Setting:
     diagonal: float = 0.3
     unit: float = 1.0
     turn: float | Literal["any"] = 60.0
-    field_energy: Literal["least", "mean"] = "least"
+    field_energy: Literal["min", "mean"] = "min"
     seed: int = 0
 
     def __post_init__(self):
+        if isinstance(self.field_energy, str) and self.field_energy in DEPRECATED_FIELD_ENERGIES:
+            current = DEPRECATED_FIELD_ENERGIES[self.field_energy]
+            warn(f"Setting(field_energy={self.field_energy!r})", f"field_energy={current!r}")
+            object.__setattr__(self, "field_energy", current)
         choices = {"trajectory": SHAPES, "displaced": ("goal", "start"), "query": QUERIES, "start": STARTS}
         choices |= {"pose_norm": POSE_NORMS, "compensator_order": COMPENSATOR_ORDERS}
         choices |= {"correlated": CORRELATED, "field_energy": FIELD_ENERGIES}
         for name, known in choices.items():
-            if getattr(self, name) not in known:
-                raise InputError(f"Setting(): {name} is {getattr(self, name)!r}; expected one of {', '.join(known)}")
-        for name, least in {"num_poses": 2, "iterations": 1, "queries": 1, "num_starts": 1, "seed": 0}.items():
-            if getattr(self, name) < least:
-                raise InputError(f"Setting(): {name} is {getattr(self, name)}; expected at least {least}")
-        if self.seed >= SEEDS:
-            raise InputError(f"Setting(): seed is {self.seed}; expected less than {SEEDS}")
-        for name in ("query_size", "diagonal", "unit", "distance", "translation_rate"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < np.inf:
-                raise InputError(f"Setting(): {name} is {value}; expected a positive number")
+            checks.choice("Setting()", name, getattr(self, name), known)
+        for name, least in {"num_poses": 2, "iterations": 1, "queries": 1, "num_starts": 1}.items():
+            checks.count("Setting()", name, getattr(self, name), least)
+        checks.seed("Setting()", self.seed)
+        optional = [name for name in ("query_size", "distance") if getattr(self, name) is not None]
+        for name in ("diagonal", "unit", "translation_rate", *optional):
+            checks.positive("Setting()", name, getattr(self, name))
         for name in ("k", "rotation_scale", "compensator"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise InputError(f"Setting(): {name} is {getattr(self, name)}; expected a number of 0 or more")
-        if self.turn != "any" and not 0 <= self.turn <= 180:
-            raise InputError(f"Setting(): turn is {self.turn}; expected 0 to 180 degrees, or 'any'")
-        if len(self.displacement) != 3 or not np.isfinite(self.displacement).all():
-            raise InputError(f"Setting(): displacement is {self.displacement}; expected three finite numbers")
+            checks.number("Setting()", name, getattr(self, name), 0)
+        if self.turn != "any":
+            checks.number("Setting()", "turn", self.turn, 0, 180, "degrees, or 'any'")
+        checks.vector("Setting()", "displacement", self.displacement, unit="")
 
     @property
     def energy(self) -> EnergyWeights:

@@ -16,8 +16,8 @@ from tdf_jax.shapes.solid import Loft, Tube, bar_line, bends_freely, encloses, i
 SHOULDERS = ("arc", "slope")
 
 _TUBE_RINGS = 30  # rings along the handle
-_STEP = 2e-4  # of the height, over which a cap widens from the neck
-_MIN_CAP = 0.005  # of the height
+_STEP = 2e-4  # share of the height over which a cap widens from the neck
+_MIN_CAP = 0.005  # smallest cap, share of the height
 
 
 @dataclass(frozen=True)
@@ -191,9 +191,12 @@ def _check(p: BottleParameters) -> None:
         if not truth:
             raise InputError(f"build_bottle(): {what}; got {p}")
 
-    need(p.shoulder_style in SHOULDERS, f"shoulder_style is {p.shoulder_style!r}; expected one of {SHOULDERS}")
     check_dimensions(
-        "build_bottle()", p, may_be_zero=("edge_radius", "cap_height", "mouth_depth"), may_be_negative=("bulge",)
+        "build_bottle()",
+        p,
+        may_be_zero=("edge_radius", "cap_height", "mouth_depth"),
+        may_be_negative=("bulge",),
+        choices={"shoulder_style": SHOULDERS},
     )
     need(0.35 <= p.aspect <= 1, f"aspect is {p.aspect}; expected 0.35 to 1")
     need(2 <= p.squareness <= 20, f"squareness is {p.squareness}; expected 2 (round) to 20 (square)")

@@ -17,7 +17,7 @@ from tdf_jax.shapes.solid import Frusta, Tube, bar_line, bends_freely, in_frusta
 HANDLE_STYLES = ("d", "ring", "ear", "square")
 
 _TUBE_RINGS = 30  # rings along the handle
-_LANDMARKS_ALONG, _LANDMARKS_UP, _LANDMARKS_AROUND = 24, 16, 32  # along the handle; up the wall and around it
+_LANDMARKS_ALONG, _LANDMARKS_UP, _LANDMARKS_AROUND = 24, 16, 32  # counts along the handle; up the wall and around it
 _MAY_BE_ZERO = ("edge_radius", "foot_height", "lip_radius")
 
 
@@ -208,8 +208,8 @@ def _check(parameters: MugParameters) -> None:
             raise InputError(f"build_mug(): {what}; got {parameters}")
 
     p = parameters
-    need(p.handle_style in HANDLE_STYLES, f"handle_style is {p.handle_style!r}; expected one of {HANDLE_STYLES}")
-    check_dimensions("build_mug()", p, may_be_zero=_MAY_BE_ZERO, may_be_negative=("bulge",))
+    styles = {"handle_style": HANDLE_STYLES}
+    check_dimensions("build_mug()", p, may_be_zero=_MAY_BE_ZERO, may_be_negative=("bulge",), choices=styles)
     for name in ("squareness", "handle_squareness"):
         need(2 <= getattr(p, name) <= 20, f"{name} is {getattr(p, name)}; expected 2 (round) to 20 (square)")
     need(1 <= p.handle_flare <= 2, f"handle_flare is {p.handle_flare}; expected 1 to 2")
@@ -299,7 +299,7 @@ def _centre_line(p: MugParameters) -> np.ndarray:
         return bar_line(x_top, x_bottom, x_bar, middle + half, middle - half, radius)
     t = np.linspace(0, 1, 160)
     if p.handle_style == "ring":
-        centre = 0.35  # of the reach; the ellipse intersects the wall beyond its widest height
+        centre = 0.35  # share of the reach; the ellipse intersects the wall beyond its widest height
         angle = (1 - 2 * t) * np.arccos(-centre / (1 - centre))
         out, up = centre + (1 - centre) * np.cos(angle), np.sin(angle) / np.sin(angle[0])
     else:

@@ -2,6 +2,7 @@
 
 import dataclasses
 from abc import ABC, abstractmethod
+from collections.abc import Collection, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -84,13 +85,7 @@ class Shape(ABC):
         Raises:
             InputError: the points are not (points, 3), or not finite.
         """
-        points, name = np.asarray(points), type(self).__name__
-        if points.ndim != 2 or points.shape[1] != 3:
-            raise InputError(f"{name}.contains(): points have shape {points.shape}; expected (points, 3)")
-        if not np.isfinite(points).all():
-            raise InputError(
-                f"{name}.contains(): points have NaN or infinite coordinates; expected finite metres. Remove them"
-            )
+        points = np.asarray(checks.coordinates(f"{type(self).__name__}.contains()", "points", points, least=0))
         inside = np.any([encloses(part, points) for part in self.solid.parts], axis=0)
         for hollow in self.solid.hollows:
             inside &= ~encloses(hollow, points)
@@ -156,9 +151,14 @@ def frame(x: float, z: float, outward: float = 1.0) -> Float[np.ndarray, "4 4"]:
 
 
 def check_dimensions(
-    function: str, parameters, *, may_be_zero: tuple[str, ...], may_be_negative: tuple[str, ...]
+    function: str,
+    parameters,
+    *,
+    may_be_zero: tuple[str, ...],
+    may_be_negative: tuple[str, ...],
+    choices: Mapping[str, Collection[str]] | None = None,
 ) -> None:
-    """Raise InputError unless all dimensions are finite and of the right sign, and flags are True or False."""
+    """Raise InputError unless dimensions are finite and of the right sign, flags are bools, and words are choices."""
     for field in dataclasses.fields(parameters):
         name, value = field.name, getattr(parameters, field.name)
         try:
@@ -169,7 +169,9 @@ def check_dimensions(
                 checks.number(function, name, value)
             elif name in may_be_zero:
                 checks.number(function, name, value, 0)
-            elif field.type is not str:
+            elif choices is not None and name in choices:
+                checks.choice(function, name, value, choices[name])
+            else:
                 checks.positive(function, name, value)
         except InputError as error:
             raise InputError(f"{error}; got {parameters}") from None

@@ -110,8 +110,7 @@ def check_stage_settings(function: str, config) -> None:
     if config.chunk_queries is not None:
         checks.count(function, "chunk_queries", config.chunk_queries)
     checks.positive(function, "start_radius", config.start_radius, "metres")
-    if not 0 <= config.tolerance < 1:
-        raise InputError(f"{function}: tolerance is {config.tolerance}; expected 0 or more and less than 1")
+    checks.number(function, "tolerance", config.tolerance, 0, below=1)
     checks.choice(function, "start", config.start, STARTS)
 
 
@@ -192,7 +191,7 @@ def solve(
         )
 
     problem = _problem(key, reference, min(config.num_coarse_queries, len(reference.query)))
-    # The starts and the demonstration go through one program: a second one would take 0.15 s more to compile.
+    # The starts and the demonstration share one program, which saves the compilation of a second one.
     together = _candidates(np.concatenate([initial.reshape(-1, 7), problem.target]), problem)
     drawn = Candidates(*(part[:-n].reshape(len(initial), n, *part.shape[1:]) for part in together[:2]))
     demonstrated = Candidates(*(part[-n:] for part in together[:2]))
@@ -214,7 +213,10 @@ def solve(
         return found, fixed
 
     def curve(found, *others):
-        """Energies (times, kept) of the best candidates of each waypoint during a stage; `others` stand still."""
+        """Energies (steps, candidates) of the best candidates of each waypoint during a stage.
+
+        The energies of `others` are constant.
+        """
         rows = [found.history, *(np.broadcast_to(other, (len(found.history), *other.shape)) for other in others)]
         ordered = np.sort(np.concatenate(rows, axis=1), axis=1)
         return ordered[:, np.minimum(np.arange(kept), ordered.shape[1] - 1)].sum(axis=2)
@@ -225,7 +227,7 @@ def solve(
         "coarse", Candidates(drawn.R[:num_keyframes, alone], drawn.centroid[:num_keyframes, alone]), waypoints=alone
     )
     curves = [curve(found)]
-    followed = [(np.arange(num_keyframes), found.history)]  # of each stage: the starts of its rows, and their energies
+    followed = [(np.arange(num_keyframes), found.history)]  # start index and energies of each row, by stage
     pruned, rows = _distinct(found, max(kept, num_keyframes // 4))
     lineage = rows[:, 0]
     found, _ = stage("prune", pruned, waypoints=alone)
@@ -321,7 +323,7 @@ def _propagated(found, picked, keyframe, demonstrated, origin):
 
 
 def _distinct(found, kept):
-    """The best distinct candidates of each waypoint, best first, and their rows (kept, free).
+    """The best distinct candidates of each waypoint, best first, and their rows (candidates, free waypoints).
 
     Where there are too few distinct ones, the next best follow.
     """

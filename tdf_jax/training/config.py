@@ -1,6 +1,7 @@
 """Settings of a training run."""
 
 import dataclasses
+import math
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.deprecation import renamed_fields
@@ -60,5 +61,5 @@ class TrainConfig:
             raise InputError(f"TrainConfig(): batch is {self.batch}; expected an even number, objects come in pairs")
         checks.positive("TrainConfig()", "learning_rate", self.learning_rate)
         checks.number("TrainConfig()", "corruption", self.corruption, 0, 1)
-        if not self.save_seconds >= 0:  # infinity never saves before the end
-            raise InputError(f"TrainConfig(): save_seconds is {self.save_seconds}; expected 0 or more")
+        if self.save_seconds != math.inf:  # which never saves before the end
+            checks.number("TrainConfig()", "save_seconds", self.save_seconds, 0)

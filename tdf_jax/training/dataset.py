@@ -76,8 +76,7 @@ class Recipe:
         for name, low in lowest.items():
             checks.count("Recipe()", name, getattr(self, name), low)
         checks.choice("Recipe()", "category", self.category, FAMILIES)
-        if self.fold not in FOLDS:
-            raise InputError(f"Recipe(): fold is {self.fold}; expected one of {', '.join(map(str, FOLDS))}")
+        checks.choice("Recipe()", "fold", self.fold, FOLDS)
         if self.meshes is None and self.fold != 1:
             raise InputError("Recipe(): fold is for meshes; generated objects have their own; omit it")
         if self.validation % 2:

@@ -96,6 +96,44 @@ def test_counts_are_whole_numbers_within_bounds(value):
         checks.count("f()", "x", value, most=5)
 
 
+@pytest.mark.parametrize("value", [-1, 2**32, 1.0, True, None])
+def test_seeds_are_those_that_jax_takes(value):
+    assert checks.seed("f()", 2**32 - 1) == 2**32 - 1
+    with pytest.raises(InputError, match=r"^f\(\): --seed is .*; expected a whole number from 0 to 4294967295$"):
+        checks.seed("f()", value, "--seed")
+
+
+@pytest.mark.parametrize("value", [3, (1, 2), (1, 2, 0), (1, 2, 3.0), (1, 2, True), "abc", None])
+def test_several_counts_are_whole_numbers_of_at_least_one(value):
+    assert checks.counts("f()", "x", np.array([1, 2, 3])) == (1, 2, 3)
+    with pytest.raises(InputError, match=r"^f\(\): x is .*; expected three whole numbers of at least 1$"):
+        checks.counts("f()", "x", value)
+
+
+def test_an_upper_bound_may_be_left_out():
+    assert checks.number("f()", "x", 0.999, 0, below=1) == 0.999
+    with pytest.raises(InputError, match=r"^f\(\): x is 1; expected one finite number of 0 or more, less than 1$"):
+        checks.number("f()", "x", 1, 0, below=1)
+
+
+def test_positions_may_have_any_axes():
+    for shape in ((3,), (0, 3), (2, 4, 3)):
+        assert checks.positions("f()", "x", np.zeros(shape)).shape == shape
+    with pytest.raises(InputError, match=r"^f\(\): x has shape \(3, 2\); expected \(..., 3\), metres$"):
+        checks.positions("f()", "x", np.zeros((3, 2)))
+
+
+def test_coordinates_may_be_none_where_the_caller_allows_it():
+    assert checks.coordinates("f()", "x", np.zeros((0, 3)), least=0).shape == (0, 3)
+
+
+def test_choices_may_be_whole_numbers():
+    assert checks.choice("f()", "x", 2, (1, 2)) == 2
+    for bad in (3, True, "1", 1.0, None, []):
+        with pytest.raises(InputError, match=r"^f\(\): x is .*; expected one of 1, 2$"):
+            checks.choice("f()", "x", bad, (1, 2))
+
+
 def test_choices_are_listed():
     assert checks.choice("f()", "x", "b", ("a", "b")) == "b"
     for bad in ("c", 1, None):

@@ -12,6 +12,7 @@ import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
 from tdf_jax.landscape.storage import Landscape, load_landscape, save_landscape
+from tdf_jax.paper.setting import Setting
 from tdf_jax.solvers.result import Result
 from tdf_jax.training import run_folder
 from tdf_jax.training.config import TrainConfig
@@ -213,6 +214,13 @@ def test_a_shape_has_clay():
     mug = tdf.build_mug()
     with pytest.warns(DeprecationWarning, match=r"^Mug.clay is deprecated; use Mug.solid$"):
         assert mug.clay is mug.solid
+
+
+def test_a_setting_of_the_paper_takes_the_former_energy():
+    with pytest.warns(
+        DeprecationWarning, match=r"^Setting\(field_energy='least'\) is deprecated; use field_energy='min'$"
+    ):
+        assert Setting(**{"field_energy": "least"}) == Setting(field_energy="min")
 
 
 @pytest.mark.parametrize(("old", "new"), [("least", "min"), ("soft_least", "softmin")])

@@ -370,7 +370,7 @@ def test_bad_target_files(refusal, weights, tmp_path, name):
 
 
 @pytest.mark.parametrize(("words", "message"), [
-    (("--method", "adam", "--k", "-0.1"), "--k is -0.1; expected a weight of 0 or more"),
+    (("--method", "adam", "--k", "-0.1"), "--k is -0.1; expected one finite number of 0 or more"),
     (("--method", "gauss-newton", "--k", "nan"), "--k is nan"),
     (("--k", "0.02"), "--k is a weight of eq. 3, which --method carry does not minimise"),
     (("--num-poses", "1"), "poses is 1; expected a whole number of at least 2"),
@@ -503,7 +503,7 @@ def test_train_refuses_bad_numbers_before_training(refusal, tmp_path, monkeypatc
     )
     check(
         refusal("train", "--out", tmp_path / "run", "--network.symmetry-breaking-offset", 1),
-        "symmetry_breaking_offset is 1.0; expected 0 to less than 1",
+        "symmetry_breaking_offset is 1.0; expected one finite number of 0 or more, less than 1",
     )
 
 
@@ -674,7 +674,7 @@ def test_every_condition_can_be_asked_for():
     (("--pairs", "-1", "--meshes", "."), "--pairs is -1"),
     (("--num-poses", "0"), "--num-poses is 0"),
     (("--seed", "-1"), "--seed is -1"),
-    (("--size", "12"), "--size is 12.0; expected metres"),
+    (("--size", "12"), "--size is 12.0; expected one finite number from 0.01 to 1, metres"),
     (("--place", "spout"), "--place is 'spout'; expected one of a mug's: handle, rim, base"),
     (("--num-starts", "0"), "num_starts is 0"),
     (("--clouds", "fog"), "views1"),

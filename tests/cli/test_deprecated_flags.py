@@ -31,7 +31,7 @@ def test_an_old_name_sets_the_option(command, capsys):
     assert stop.value.code == 2
     assert capsys.readouterr().err.splitlines() == [
         "tdf: warning: --poses is deprecated; use --num-poses",
-        f"tdf: error: tdf {command}: --num-poses is 0; expected at least 1",
+        f"tdf: error: tdf {command}: --num-poses is 0; expected a whole number of at least 1",
     ]
 
 
@@ -47,3 +47,14 @@ def test_an_old_choice_stands_for_the_new_one_with_a_warning(old, new, capsys):
         assert capsys.readouterr().err == f"tdf: warning: --reduce {old} is deprecated; use --reduce {new}\n"
     for words in (["imitate", "--reduce", old], ["landscape", "--out", old]):
         assert command_line._current(words) == words and capsys.readouterr().err == ""
+
+
+def test_the_old_energy_of_a_field_stands_for_the_new_one_with_a_warning(capsys):
+    with pytest.raises(SystemExit) as stop:
+        command_line.main(["reproduce", "fig1", "--field-energy", "least", "--trajectory", "wave", "--k", "-1"])
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.splitlines()[0] == (
+        "tdf: warning: --field-energy least is deprecated; use --field-energy min"
+    )
+    words = ["reproduce", "fig2", "--field-energy=mean"]
+    assert command_line._current(words) == words and capsys.readouterr().err == ""

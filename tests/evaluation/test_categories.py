@@ -74,7 +74,7 @@ def test_an_object_of_a_symmetry_can_be_asked_for(fold):
 
 
 def test_a_place_of_another_category_is_refused():
-    with pytest.raises(tdf.InputError, match="place is 'handle'; expected one of a bowl's: rim, base, body"):
+    with pytest.raises(tdf.InputError, match="place of a bowl is 'handle'; expected one of rim, base, body"):
         generated_case("bowl", 0, 0, place="handle")
 
 

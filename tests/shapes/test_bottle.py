@@ -295,7 +295,7 @@ RISE = "expected edge_radius, shoulder_bottom, shoulder_top and height to rise i
     ({"aspect": 1.1}, "aspect is 1.1"),
     ({"squareness": 1.9}, "squareness is 1.9; expected 2 (round) to 20 (square)"),
     ({"squareness": 21.0}, "squareness is 21.0"),
-    ({"shoulder_style": "dome"}, "shoulder_style is 'dome'; expected one of ('arc', 'slope')"),
+    ({"shoulder_style": "dome"}, "shoulder_style is 'dome'; expected one of arc, slope"),
     ({"shoulder_curve": 0.9}, "shoulder_curve is 0.9; expected 1 to 4"),
     ({"shoulder_curve": 4.1}, "shoulder_curve is 4.1"),
     ({"neck_taper": 0.4}, "neck_taper is 0.4; expected 0.5 to 1.1"),

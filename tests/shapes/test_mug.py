@@ -434,7 +434,7 @@ def test_bad_dimensions_are_refused_by_name(change, message):
 @pytest.mark.parametrize("category, name", [("mug", "Mug"), ("bowl", "Bowl"), ("bottle", "Bottle")])
 def test_bad_arguments_are_refused(category, name):
     shape = FAMILIES[category].build()
-    with pytest.raises(InputError, match=rf"{name}.contains\(\): points have shape \(5, 2\)"):
+    with pytest.raises(InputError, match=rf"{name}.contains\(\): points has shape \(5, 2\)"):
         shape.contains(np.zeros((5, 2)))
     with pytest.raises(InputError, match="NaN"):
         shape.contains(np.array([[0.0, np.nan, 0.0]]))
