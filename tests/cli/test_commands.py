@@ -107,6 +107,7 @@ def test_the_default_method_carries(imitate, watched, capsys):
     )
 
 
+@pytest.mark.slow
 def test_the_papers_energy_can_be_solved(imitate, watched, capsys):
     record = imitate(
         "--points", 60, "--num-poses", 4, "--queries", 8, "--num-starts", 2, "--method", "gauss-newton", "--k", 0.1

@@ -72,6 +72,7 @@ def test_the_record_and_the_landscape_agree(sweep):
     assert record["one_by_one"] == 125 * record["queries"]
 
 
+@pytest.mark.slow
 def test_query_points_as_they_are_share_nothing_and_change_nothing(sweep):
     record, _ = sweep("--query", "given")
     assert record["query_change"] is None

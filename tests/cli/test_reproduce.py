@@ -25,6 +25,7 @@ def small():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(settings, "POINTS", POINTS)
         patch.setattr(command, "FAST", {})
+        patch.setattr("tdf_jax.viz.style.DPI", 30)
         patch.setattr(command, "FAST_GRID", 4)
         patch.setattr(table, "FAST_VARIATIONS", ("k = 0", "l_p for l_c, infinity"))
         yield

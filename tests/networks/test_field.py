@@ -264,7 +264,8 @@ def test_clouds_of_many_sizes_run_one_program_and_what_fills_them_up_does_not_co
         np.testing.assert_allclose(traced.latent, field.latent, atol=2e-6 * np.abs(plain).max())
 
 
-@pytest.mark.parametrize("model", [pytest.param("small_model", marks=pytest.mark.slow), "subsampling_model"])
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["small_model", "subsampling_model"])
 def test_the_latent_has_a_gradient_with_respect_to_the_parameters(model, request):
     model, cloud = request.getfixturevalue(model), random_cloud(0, 90).astype(np.float32)
 

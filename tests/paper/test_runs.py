@@ -217,6 +217,7 @@ def test_a_run_is_the_optimisation_of_its_settings(small_model, run):
     np.testing.assert_allclose(run.expected_energy, energy, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_free_last_pose_moves_and_another_seed_is_another_experiment(small_model, run):
     free = imitation(small_model, dataclasses.replace(TINY, fix_last=False))
     np.testing.assert_allclose(free.initial_trajectories[:, -1], run.initial_trajectories[:, -1])

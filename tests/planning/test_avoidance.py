@@ -107,10 +107,10 @@ def test_a_wall_between_two_poses_is_seen_and_passed():
     """No pose is nearer than 1.3 cm to the wall, and the gradients at its sides do not lead out of it."""
     wall = box_obstacle((0.0, 0.1667, 0.05), (0.4, 0.002, 0.3))
     body = BODY * np.float32([1, 0.1, 1])
-    found = clearance(LINE, body, [wall])
+    found = clearance(LINE, body, [AWAY, wall])
     assert found.waypoints.min() > 0.01 and found.min < 0
-    cleared = push_clear(LINE, body, [wall])
-    assert_clear(cleared, LINE, [wall], body=body)
+    cleared = push_clear(LINE, body, [AWAY, wall])
+    assert_clear(cleared, LINE, [AWAY, wall], body=body)
     # Under it is the shortest way.
     assert np.asarray(cleared.trajectory.translations)[2:4, 2].max() < -0.1
 

@@ -235,6 +235,7 @@ def test_a_start_that_becomes_non_finite_is_reported_and_the_others_are_unaffect
             _ = lost.trajectory
 
 
+@pytest.mark.slow
 def test_mixed_precisions_promote(field, reference, result):
     """A float32 trajectory from a file, with the float64 query points that jax draws where it may."""
     with jax.enable_x64(True):

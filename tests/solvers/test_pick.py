@@ -160,6 +160,7 @@ def test_the_residual_is_that_of_the_best_pick(result, picked):
     assert np.isnan(result.confidence)  # `imitate` knows the weights, and whether a curve was fitted to them
 
 
+@pytest.mark.slow
 def test_one_query_point_has_no_residual(small_model, field, demonstration):
     reference = tdf.describe(small_model, dataclasses.replace(demonstration, query=demonstration.query[:1]))
     assert np.isnan(tdf.carry(field, reference, KEY, config=CONFIG).residual)
