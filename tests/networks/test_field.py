@@ -258,7 +258,7 @@ def test_clouds_of_many_sizes_run_one_program_and_what_fills_them_up_does_not_co
     assert names == []
     for cloud, field in zip(clouds, fields):
         plain = latent_of(small_model.params, small_model.config, cloud - cloud.mean(axis=0))
-        np.testing.assert_allclose(field.latent, plain, atol=2e-6 * np.abs(plain).max())
+        np.testing.assert_allclose(field.latent, plain, atol=5e-6 * np.abs(plain).max())  # rounding of float32
         np.testing.assert_allclose(field.origin, cloud.mean(axis=0), atol=1e-7)
         traced = jax.jit(lambda points: tdf.encode(model, points))(cloud)
         np.testing.assert_allclose(traced.latent, field.latent, atol=2e-6 * np.abs(plain).max())

@@ -267,7 +267,7 @@ def test_minutes_become_steps(sets, monkeypatch):
     # 0.5 s a step by that clock, nine tenths of the time
     assert loop.steps_within(10, CONFIG, sets[0], 1) == loop.steps_within(10, CONFIG, sets[0]) == 1080
     with pytest.raises(
-        InputError, match=r"0.01 minutes are enough for 1 steps of 0.50 s; expected time for more than 2"
+        InputError, match=r"0.01 minutes are sufficient for 1 steps of 0.50 s; expected time for more than 2"
     ):
         loop.steps_within(0.01, CONFIG, sets[0])
 
