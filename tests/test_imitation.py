@@ -124,6 +124,7 @@ def test_bad_input_is_refused(imitate, reference, settings, message):
         imitate(reference, **settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("starts", [3, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("config", [CONFIG, CARRY.solver])
 def test_a_demonstration_of_one_pose_is_found_where_it_is_free(imitate, demonstration, config, starts):

@@ -83,6 +83,7 @@ def test_rotations_are_multiplied_exactly_whatever_is_set():
         assert precisions(se3.multiply, jnp.eye(3), jnp.eye(3)) == {EXACT}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("optimise", "config", "module", "program"), [
     (tdf.solve, tdf.SolveConfig(num_trajectory_starts=2), gauss_newton, "descend"),
     (tdf.optimize, tdf.OptimizeConfig(num_starts=2, iterations=2), sys.modules["tdf_jax.solvers.adam"], "_run"),

@@ -134,6 +134,7 @@ TOLERANCE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("category", ["bowl", "bottle"])
 def test_places_of_generated_bowls_and_bottles_are_found_to_millimetres(sampled, category):
     errors = {place: [] for place in FAMILIES[category].places}

@@ -104,6 +104,7 @@ def carried_last(task):
     return shown_in(task)[-1, 4:] + shift
 
 
+@pytest.mark.slow
 def test_24_tasks_are_every_path_with_every_goal_and_six_are_every_path(case):
     kinds = [(task.path, task.displacement) for task in (make_task(case, 0, index) for index in range(24))]
     assert set(kinds) == {(path, displacement) for path in PATHS for displacement in DISPLACEMENTS}

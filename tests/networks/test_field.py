@@ -111,6 +111,7 @@ def test_gradients_are_finite_everywhere(field):
     assert np.isfinite(gradients(field.origin + jnp.array([1e6, -1e5, 0.0]))).all()
 
 
+@pytest.mark.slow
 def test_gradients_reach_the_points_of_the_least_cloud_where_some_coincide(small_model):
     """21 points are enough, and duplicates have edges of length zero."""
     points = jnp.asarray(np.tile(random_cloud(0, 7), (3, 1)), jnp.float32)
@@ -152,6 +153,7 @@ def displacing_model(subsampling_model):
     )
 
 
+@pytest.mark.slow
 def test_a_displaced_cloud_is_seen_away_from_its_farthest_point(small_model, displacing_model):
     """All subsamples alike, by the farthest point of the whole cloud; where the field is, is not displaced."""
     points = random_cloud(0, 90).astype(np.float32)

@@ -103,6 +103,7 @@ def test_a_box_across_a_line_is_passed_by_the_near_side():
     np.testing.assert_array_equal(again.trajectory.wxyz_xyz, cleared.trajectory.wxyz_xyz)
 
 
+@pytest.mark.slow
 def test_a_wall_between_two_poses_is_seen_and_passed():
     """No pose is nearer than 1.3 cm to the wall, and the gradients at its sides do not lead out of it."""
     wall = box_obstacle((0.0, 0.1667, 0.05), (0.4, 0.002, 0.3))

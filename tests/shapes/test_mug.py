@@ -105,6 +105,7 @@ def test_a_family_builds_its_category_with_its_places_in_a_frame_that_stands_upr
             np.testing.assert_array_equal(frame[3], [0, 0, 0, 1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("category, seed", [(category, seed) for category in OTHERS for seed in range(3)])
 def test_contains_of_every_family_agrees_with_the_winding_number_of_the_mesh(category, seed):
     """Points keep 2e-4 m from the surface: a bottle's mesh splits the quadrilaterals of its shoulder into triangles."""

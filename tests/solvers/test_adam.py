@@ -248,6 +248,7 @@ def test_mixed_precisions_promote(field, reference, result):
 # ---- finding a pose ----
 
 
+@pytest.mark.slow
 def test_a_known_pose_is_found_on_the_same_object(golden, quick_compilation):
     """From 40 degrees and 3 cm away, the demonstrated grasp is found on the moved object to 1 degree and 1 mm."""
     points = golden.arrays["point_cloud"][0] + (0.3, -0.2, 0.1)

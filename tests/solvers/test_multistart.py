@@ -133,6 +133,7 @@ def test_a_step_solves_the_damped_system_and_is_bounded():
     np.testing.assert_allclose(cosine, 1, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_chunks_do_not_show(field, reference):
     problem = solve._problem(KEY, reference, 3)
     drawn = solve._candidates(random_starts(KEY, field, reference, 2, "carried", 0.1), problem)
@@ -317,6 +318,7 @@ def test_results_are_a_function_of_the_key(field, reference, result):
     assert np.abs(other.trajectories - result.trajectories)[:, :-1].max() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_stage_ends_when_no_step_promises_enough(field, reference):
     result = run(field, reference, config=dataclasses.replace(CONFIG, **LONG, tolerance=0.5))
     np.testing.assert_array_equal(result.candidate_history[:, -29:], np.tile(result.candidate_history[:, -1:], 29))

@@ -63,6 +63,7 @@ def test_a_fit_recovers_the_curve_of_simulated_cases():
     np.testing.assert_allclose(logistic(features, right), CURVE, atol=0.12)
 
 
+@pytest.mark.slow
 def test_shipped_weights_judge_the_object_and_others_do_not(small_model, monkeypatch):
     cloud, other = (random_cloud(seed).astype(np.float32) for seed in (3, 4))
     demonstration = tdf.Demonstration(cloud, tdf.line(num_poses=2), tdf.box_query(KEY, 8))
