@@ -303,6 +303,7 @@ def test_thinning_refuses_bad_input():
         thin(CLOUD[:, :2], 5)
 
 
+@pytest.mark.slow
 def test_importing_does_not_load_trimesh():
     code = "import sys, tdf_jax.io.pointclouds; sys.exit('trimesh' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

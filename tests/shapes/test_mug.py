@@ -445,6 +445,7 @@ def test_bad_arguments_are_refused(category, name):
     assert shape.contains(np.zeros((0, 3))).shape == (0,)
 
 
+@pytest.mark.slow
 def test_importing_shapes_does_not_load_trimesh():
     code = "import sys, tdf_jax.shapes; sys.exit('trimesh' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -57,6 +57,9 @@ def energy_of(trajectories, field, reference, weights=WEIGHTS):
 # ---- the quadratic model ----
 
 
+evaluate = jax.jit(gauss_newton._evaluate, static_argnums=7)
+
+
 def moved(R, place, step):
     return se3.exp(step[:3]) @ R, place + step[3:]
 
@@ -74,7 +77,7 @@ def test_energies_and_gradients_are_those_of_the_energy(field, reference, pose_n
     drawn = solve._candidates(starts, problem)
     R, place = drawn.R.reshape(-1, 3, 3), drawn.centroid.reshape(-1, 3)
     waypoint = np.tile(np.arange(4), 5)
-    values = gauss_newton._evaluate(R, place, waypoint, np.array([20, 20, 3, 0]), field, problem, weights, 128)
+    values = evaluate(R, place, waypoint, np.array([20, 20, 3, 0]), field, problem, weights, 128)
 
     def energy(step, R, place, index):
         R, place = moved(R, place, step)
@@ -108,7 +111,7 @@ def test_the_curvature_is_that_of_reweighted_squares(field, reference):
     size = np.abs(value)
     weights = 1 / np.maximum(size, size.mean(axis=-1, keepdims=True)) / value.size
     expected = np.einsum("qca,qc,qcb->ab", jacobian, weights, jacobian)
-    _, _, hessian = gauss_newton._match(R, place, field, problem.query[0], problem.weights[0] / 8, shown)
+    _, _, hessian = jax.jit(gauss_newton._match)(R, place, field, problem.query[0], problem.weights[0] / 8, shown)
     np.testing.assert_allclose(hessian[0], expected, atol=1e-4 * np.abs(expected).max())
 
 

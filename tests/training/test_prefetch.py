@@ -47,7 +47,7 @@ def failing(data, step):
     return step
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_batches_come_in_the_order_of_steps_and_do_not_depend_on_who_draws_them(data, workers):
     batch = functools.partial(batch_of, CONFIG, gradual=False)
     with prefetched(batch, data, 5, workers) as batches:
