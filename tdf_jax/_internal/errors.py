@@ -5,5 +5,21 @@ class InputError(ValueError):
     """Raised for a user's mistake: the message names the function, what it got, what it expected and the fix."""
 
 
-class CategoryWarning(UserWarning):
+class TdfWarning(UserWarning):
+    """Base class of the warnings of tdf_jax; `tdf` prints them as lines of their own."""
+
+
+class CategoryWarning(TdfWarning):
     """Issued if an object is probably not of the category of the network and the demonstration."""
+
+
+class ConfidenceWarning(TdfWarning):
+    """Issued if a pick is probably wrong."""
+
+
+class SizeWarning(TdfWarning):
+    """Issued if an object is far smaller or larger than those that the network was trained on."""
+
+
+class InvalidPointsWarning(TdfWarning):
+    """Issued if points are removed because they are no measurements."""
