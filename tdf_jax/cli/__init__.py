@@ -3,4 +3,6 @@
 Modules:
     main: the commands, and errors as messages
     options: options that commands share
+    pictures: optional outputs, which may fail
+    streams: standard output and error, which may fail
 """

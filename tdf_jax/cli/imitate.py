@@ -3,9 +3,7 @@
 import contextlib
 import dataclasses
 import json
-import sys
 import time
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,9 +14,10 @@ import tyro
 from tqdm import tqdm
 
 import tdf_jax
-from tdf_jax._internal.errors import CategoryWarning, InputError
+from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file, replace_folder
 from tdf_jax.cli.options import Settings, make_scene, resolved
+from tdf_jax.cli.pictures import Pictures
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import describe
 from tdf_jax.evaluation.metrics import path_error, pose_error
@@ -48,12 +47,14 @@ def imitate(settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()) 
     Writes a folder with result.json, trajectory.npz, trajectory.tum, imitation.png and loss.png.
     """
     settings = resolved(settings)
+    pictures = Pictures("tdf imitate")
     with replace_folder("tdf imitate", settings.out, RESULT, NAMES) as folder:
-        record = _run(settings, folder)
+        record = _run(settings, folder, pictures)
     print(json.dumps(record, indent=1) if settings.json else _table(record, settings.out))
+    pictures.check()
 
 
-def _run(settings: Settings, folder: Path) -> dict:
+def _run(settings: Settings, folder: Path, pictures: Pictures) -> dict:
     """Imitate, write the folder and return the record."""
     seconds = {}
     began = time.perf_counter()
@@ -68,26 +69,23 @@ def _run(settings: Settings, folder: Path) -> dict:
     with _timed(seconds, "encode"):
         reference = jax.block_until_ready(describe(model, scene.demonstration))
     with _timed(seconds, "optimise"), _progress(config.num_steps) as progress:
-        with warnings.catch_warnings(record=True) as doubts:
-            warnings.simplefilter("always", CategoryWarning)
-            result = imitate_scene(
-                model,
-                reference,
-                scene.points,
-                key=start_key,
-                goal_offset=np.array(settings.goal_offset),
-                energy=energy,
-                config=config,
-                progress=progress,
-            )
+        result = imitate_scene(
+            model,
+            reference,
+            scene.points,
+            key=start_key,
+            goal_offset=np.array(settings.goal_offset),
+            energy=energy,
+            config=config,
+            progress=progress,
+        )
         trajectory = jax.block_until_ready(result.trajectory)
     save_trajectory(folder / "trajectory.npz", trajectory)
     save_trajectory(folder / "trajectory.tum", trajectory)
     if not settings.no_plots:
         with _timed(seconds, "plots"):
-            _draw(folder, scene, result, "start" if isinstance(config, OptimizeConfig) else "candidate")
-    for doubt in doubts:
-        print(f"tdf: warning: {doubt.message}", file=sys.stderr)
+            rows = "start" if isinstance(config, OptimizeConfig) else "candidate"
+            _draw(folder, scene, result, rows, pictures)
     seconds["total"] = time.perf_counter() - began
     record = _record(settings, model, scene, energy, config, result, seconds)
     replace_file("tdf imitate", folder / RESULT, json.dumps(record, indent=1).encode())
@@ -109,17 +107,23 @@ def _config(settings: Settings) -> CarryConfig | SolveConfig | OptimizeConfig:
     return CarryConfig(**starts)
 
 
-def _draw(folder: Path, scene: Scene, result: Result, rows: str) -> None:
-    from tdf_jax.viz.imitation import imitation_figure, loss_figure
-    from tdf_jax.viz.style import save_figure
+def _draw(folder: Path, scene: Scene, result: Result, rows: str, pictures: Pictures) -> None:
+    with pictures.drawing(folder / "imitation.png") as path:
+        from tdf_jax.viz.imitation import imitation_figure
+        from tdf_jax.viz.style import save_figure
 
-    trajectory = result.trajectory
-    expected = scene.expected(trajectory.wxyz_xyz[-1], trajectory.wxyz_xyz[0])
-    title = _title(float(result.loss), _errors(trajectory, expected))
-    figure = imitation_figure(scene.demonstration, scene.points, trajectory, expected, scene.meshes, title)
-    save_figure(folder / "imitation.png", figure)
-    history = np.column_stack([result.candidate_history, result.energies])
-    save_figure(folder / "loss.png", loss_figure(history, int(result.best), rows=rows))
+        trajectory = result.trajectory
+        expected = scene.expected(trajectory.wxyz_xyz[-1], trajectory.wxyz_xyz[0])
+        title = _title(float(result.loss), _errors(trajectory, expected))
+        save_figure(
+            path, imitation_figure(scene.demonstration, scene.points, trajectory, expected, scene.meshes, title)
+        )
+    with pictures.drawing(folder / "loss.png") as path:
+        from tdf_jax.viz.imitation import loss_figure
+        from tdf_jax.viz.style import save_figure
+
+        history = np.column_stack([result.candidate_history, result.energies])
+        save_figure(path, loss_figure(history, int(result.best), rows=rows))
 
 
 @contextlib.contextmanager

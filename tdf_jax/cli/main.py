@@ -1,14 +1,20 @@
 """`tdf`, the command line: names its commands and turns a user's mistake into a message and an exit code."""
 
+import contextlib
 import importlib
-import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+import warnings
+from collections.abc import Iterator, Sequence
 
 import jax
 import tyro
+from tqdm import tqdm
 
-from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.errors import InputError, TdfWarning
+from tdf_jax.cli.pictures import PictureError
+from tdf_jax.cli.streams import guarded, lost
 from tdf_jax.landscape.storage import DEPRECATED_REDUCTIONS
 from tdf_jax.paper.setting import DEPRECATED_FIELD_ENERGIES
 
@@ -29,6 +35,10 @@ DEPRECATED_CHOICES = {
     "landscape": {"--reduce": DEPRECATED_REDUCTIONS},
     "reproduce": {"--field-energy": DEPRECATED_FIELD_ENERGIES},
 }
+# Signals that ask a command to stop, and what it says then.
+SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
+if hasattr(signal, "SIGHUP"):
+    SIGNALS[signal.SIGHUP] = "terminated, because its terminal was closed"
 STYLE = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)  # `--json` without `--no-json`, no word for "not given"
 
 
@@ -39,30 +49,96 @@ def main(arguments: Sequence[str] | None = None) -> None:
         arguments: the words after `tdf`; by default the process's.
 
     Raises:
-        SystemExit: 2 for a user's mistake, 130 for an interruption, each with a line on stderr; 0 after --help.
+        SystemExit: 0 after --help; otherwise with a line on stderr: 1 if a picture is missing, the output cannot be
+            written or the system fails, 2 for a user's mistake, 128 and its number for a signal (130 for Ctrl-C, 143
+            for SIGTERM), 141 if nobody reads the output.
     """
-    commands = {name: getattr(importlib.import_module(f"tdf_jax.cli.{name}"), name) for name in COMMANDS}
+    with guarded() as streams:
+        code = _code(sys.argv[1:] if arguments is None else arguments)
+        for stream in streams:
+            stream.flush()
+        unwritten = lost(streams)
+        if unwritten is not None:
+            code = _failed(f"error: {unwritten[0]}", unwritten[1]) if not code else code
+    if code is not None:
+        raise SystemExit(code)
+
+
+def _code(arguments: Sequence[str]) -> int | str | None:
+    """Run one command, and give its exit code; None if it ends without one."""
+    stopped: list[signal.Signals] = []
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            commands,
-            prog="tdf",
-            description="Imitate a demonstrated pick-and-place trajectory on new objects.",
-            args=_current(sys.argv[1:] if arguments is None else arguments),
-            config=STYLE,
-        )
-        sys.stdout.flush()
-    except (InputError, FloatingPointError) as error:
-        _fail(f"error: {error}", 2)
-    except MemoryError:
-        _fail(MEMORY, 2)
-    except jax.errors.JaxRuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):
-            raise
-        _fail(MEMORY, 2)
-    except KeyboardInterrupt:
-        _fail("interrupted", 130)
-    except BrokenPipeError:  # `tdf imitate --json | head`: nobody reads on, and Python would complain again at exit
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        with _warnings(), _signals(stopped):
+            commands = {name: getattr(importlib.import_module(f"tdf_jax.cli.{name}"), name) for name in COMMANDS}
+            tyro.extras.subcommand_cli_from_dict(
+                commands,
+                prog="tdf",
+                description="Imitate a demonstrated pick-and-place trajectory on new objects.",
+                args=_current(arguments),
+                config=STYLE,
+            )
+    except BaseException as error:
+        # An error that follows a signal, as of processes that it ended too, is not the reason.
+        if stopped:
+            return _failed(SIGNALS[stopped[0]], 128 + stopped[0])
+        if isinstance(error, SystemExit):
+            return error.code
+        if isinstance(error, InputError | FloatingPointError):
+            return _failed(f"error: {error}", 2)
+        if isinstance(error, MemoryError) or (
+            isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" in str(error)
+        ):
+            return _failed(MEMORY, 2)
+        if isinstance(error, PictureError | OSError):
+            return _failed(f"error: {error}", 1)
+        if isinstance(error, KeyboardInterrupt):
+            return _failed(SIGNALS[signal.SIGINT], 128 + signal.SIGINT)
+        raise
+    return None
+
+
+@contextlib.contextmanager
+def _signals(stopped: list[signal.Signals]) -> Iterator[None]:
+    """Let signals that ask to stop raise a KeyboardInterrupt, so that unfinished files are removed.
+
+    Args:
+        stopped: receives the signals.
+    """
+
+    def stop(number, frame):
+        stopped.append(signal.Signals(number))
+        raise KeyboardInterrupt
+
+    before = {}
+    if threading.current_thread() is threading.main_thread():  # others cannot set handlers
+        # A handler of a program that calls this one stays, and so does what nohup ignores.
+        defaults = signal.SIG_DFL, signal.default_int_handler
+        before = {one: signal.getsignal(one) for one in SIGNALS if signal.getsignal(one) in defaults}
+    try:
+        for one in before:
+            signal.signal(one, stop)
+        yield
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
+
+
+@contextlib.contextmanager
+def _warnings() -> Iterator[None]:
+    """Print warnings of tdf_jax as lines, each once, also beside a progress bar; all others stay as they are."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", TdfWarning)
+        others, printed = warnings.showwarning, set()
+
+        def show(message, category, filename, lineno, file=None, line=None):
+            if not issubclass(category, TdfWarning):
+                others(message, category, filename, lineno, file, line)
+            elif str(message) not in printed:
+                printed.add(str(message))
+                tqdm.write(f"tdf: warning: {message}", file=sys.stderr)
+
+        warnings.showwarning = show
+        yield
 
 
 def _current(arguments: Sequence[str]) -> list[str]:
@@ -86,6 +162,6 @@ def _current(arguments: Sequence[str]) -> list[str]:
     return current
 
 
-def _fail(message: str, code: int) -> None:
+def _failed(message: str, code: int) -> int:
     print(f"tdf: {message}", file=sys.stderr)
-    raise SystemExit(code)
+    return code
