@@ -10,7 +10,14 @@
 `T_world_query` is the pose of the query frame in the world.
 """
 
-from tdf_jax._internal.errors import CategoryWarning as CategoryWarning, InputError as InputError
+from tdf_jax._internal.errors import (
+    CategoryWarning as CategoryWarning,
+    ConfidenceWarning as ConfidenceWarning,
+    InputError as InputError,
+    InvalidPointsWarning as InvalidPointsWarning,
+    SizeWarning as SizeWarning,
+    TdfWarning as TdfWarning,
+)
 from tdf_jax.energy.descriptors import (
     pose_descriptor as pose_descriptor,
     trajectory_descriptor as trajectory_descriptor,
@@ -50,11 +57,19 @@ from tdf_jax.geometry.query import (
     lattice_query as lattice_query,
     snapped_query as snapped_query,
 )
-from tdf_jax.geometry.sampling import sample_surface as sample_surface, thin as thin
+from tdf_jax.geometry.sampling import (
+    drop_invalid as drop_invalid,
+    sample_surface as sample_surface,
+    thin as thin,
+)
 from tdf_jax.geometry.se3 import rotation_grid as rotation_grid, turns as turns
 from tdf_jax.geometry.trajectory import Trajectory as Trajectory, displace as displace, resample as resample
 from tdf_jax.geometry.transport import carry_trajectory as carry_trajectory
 from tdf_jax.imitation import imitate as imitate, imitate_batch as imitate_batch
+from tdf_jax.io.demonstrations import (
+    load_demonstration as load_demonstration,
+    save_demonstration as save_demonstration,
+)
 from tdf_jax.io.meshes import load_mesh as load_mesh
 from tdf_jax.io.pointclouds import load_points as load_points
 from tdf_jax.io.trajectories import load_trajectory as load_trajectory, save_trajectory as save_trajectory
@@ -123,6 +138,7 @@ __all__ = [
     "cluster_poses",
     "compensator_loss",
     "confidence",
+    "ConfidenceWarning",
     "convert_checkpoint",
     "correlation_loss",
     "Demonstration",
@@ -130,6 +146,7 @@ __all__ = [
     "descriptor_loss",
     "DescriptorField",
     "displace",
+    "drop_invalid",
     "encode",
     "energy_landscape",
     "EnergyWeights",
@@ -141,10 +158,12 @@ __all__ = [
     "imitate",
     "imitate_batch",
     "InputError",
+    "InvalidPointsWarning",
     "Landscape",
     "lattice_query",
     "lift_over",
     "line",
+    "load_demonstration",
     "load_landscape",
     "load_mesh",
     "load_model",
@@ -173,14 +192,17 @@ __all__ = [
     "sample_bowl",
     "sample_mug",
     "sample_surface",
+    "save_demonstration",
     "save_landscape",
     "save_model",
     "save_trajectory",
     "semicircle",
+    "SizeWarning",
     "snapped_query",
     "solve",
     "SolveConfig",
     "surface_logit",
+    "TdfWarning",
     "thin",
     "tilt_and_pour",
     "Trajectory",

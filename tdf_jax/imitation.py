@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.deprecation import caller_level, renamed_keywords
-from tdf_jax._internal.errors import CategoryWarning, InputError
+from tdf_jax._internal.errors import CategoryWarning, ConfidenceWarning, InputError
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference, describe
 from tdf_jax.geometry.demonstration import Demonstration
@@ -24,7 +24,8 @@ from tdf_jax.solvers.pick import CarryConfig, carry
 from tdf_jax.solvers.result import Result
 from tdf_jax.uncertainty.calibration import CALIBRATED, CURVES, confidence, recognition, surface_logit
 
-DOUBT = 0.5  # probability of the demonstration's category below which a warning is issued
+# Probability of the demonstration's category, or of a right pick, below which a warning is issued.
+DOUBT = 0.5
 
 
 @renamed_keywords(mesh="device_mesh")
@@ -55,12 +56,12 @@ def imitate(
         demonstration: one, several with the same query points, or a `Reference` from `describe` to share between calls.
         points: point cloud of the new object, (points, 3), metres, world frame.
         key: random key, such as `jax.random.key(0)`; the result is a function of it.
-        goal: last pose, (7,), T_world_query as `wxyz_xyz`; by default, with `fix_last`, the demonstration's last pose,
-            moved by the centroids.
+        goal: pose at the release, (7,), T_world_query as `wxyz_xyz`; by default, with `fix_last`, the demonstration's,
+            moved by the centroids. Poses after the release follow it rigidly.
         goal_offset: vector that is added to the goal's translation, (3,), metres, world frame.
-        fix_last: keep the last pose at the goal. Otherwise, such as for the one pose of a grasp, the demonstration is
-            carried rigidly with the pick; with the other configs all poses are free, and a goal is where the last one
-            starts.
+        fix_last: keep the pose at the release at the goal. Otherwise, such as for the one pose of a grasp, the
+            demonstration is carried rigidly with the pick; with the other configs all poses are free, and a goal is
+            where the pose at the release starts.
         energy: weights of the terms of eq. 3, by default the paper's; only with a `config` that minimises it.
         config: settings of `carry`, of `solve`, or, for Adam as in the paper and for energies with eq. 6, of
             `optimize`.
@@ -68,11 +69,15 @@ def imitate(
         device_mesh: see `solve` and `optimize`.
 
     Returns:
-        The result; `.trajectory` is the best trajectory, T_world_query. A `CategoryWarning` is issued if the object is
-        probably of another category than the demonstration's. This is known for shipped weights and the default config.
+        The result; `.trajectory` is the best trajectory, T_world_query.
 
     Raises:
         InputError: bad points, goal, offset or settings, or an energy that `carry` would not use.
+
+    Warns:
+        CategoryWarning: the object is probably of another category than the demonstration's.
+        ConfidenceWarning: the pick is probably wrong. Both are known for shipped weights and the default config.
+        SizeWarning: see `encode`.
     """
     checks.key("imitate()", key)
     if not isinstance(config, CarryConfig | SolveConfig | OptimizeConfig):
@@ -110,6 +115,13 @@ def _judged(result: Result, weights: str, field, points) -> Result:
             "imitate(): the object does not look like one of the demonstration's category to the weights "
             f"{weights!r} (probability {recognised:.2g}); check the target, its unit and the weights",
             CategoryWarning,
+            stacklevel=caller_level(),
+        )
+    if confident is not None and confident < DOUBT and (recognised is None or recognised >= DOUBT):
+        warnings.warn(
+            f"imitate(): the pick is right with a probability of {confident:.2g} only. Check that the cloud shows the "
+            "place to pick and nothing but the object, add a second view, or compare the other candidates",
+            ConfidenceWarning,
             stacklevel=caller_level(),
         )
     known = {"recognised": recognised, "confidence": confident}

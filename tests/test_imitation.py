@@ -110,7 +110,7 @@ def test_progress_is_passed_on(imitate, reference):
         ({"points": TARGET[:, :2]}, "shape"),
         ({"goal": np.zeros(6)}, r"goal has shape \(6,\); expected one pose wxyz_xyz, \(7,\)"),
         ({"goal": np.full(7, np.inf)}, "goal is .*expected one finite pose"),
-        ({"goal": np.zeros(7)}, "quaternion not zero"),
+        ({"goal": np.zeros(7)}, "a quaternion of norm 0"),
         ({"goal_offset": (0, 1)}, r"goal_offset is \(0, 1\); expected three finite numbers"),
         ({"goal_offset": (0, 1, np.nan)}, "goal_offset is .*expected three finite"),
         ({"config": 100}, "config is 100; expected a CarryConfig, SolveConfig or OptimizeConfig"),

@@ -1,6 +1,7 @@
 """What every package uses and no user imports.
 
 Modules:
+    boundary: settings of JAX, traced values and foreign arrays of callers
     cache: results kept by digest
     checks: validators of arguments
     deprecation: names of the release before

@@ -16,6 +16,10 @@ from numpy.typing import ArrayLike
 from tdf_jax._internal.errors import InputError
 
 SEEDS = 2**32  # jax truncates a larger seed to 32 bits without a warning
+# Metres. Up to 512 m float32 numbers are at most 0.03 mm from any coordinate, and a pose is the sum of a few of them.
+FARTHEST = 500.0
+UNIT_NORM = 1e-3  # largest deviation of a quaternion's norm from 1: rounding to three decimals, or to float16
+SENTINEL_SHARE = 0.01  # share of the rows that may have one value, where other values are not as common
 MINIMUM_POINTS = 21  # the encoder's 20 nearest neighbours, the point itself included, and one to choose from
 
 
@@ -128,16 +132,61 @@ def coordinates(
 
 
 def pose(function: str, name: str, value: ArrayLike) -> ArrayLike:
-    """Check that a value is one finite pose `wxyz_xyz` whose quaternion is not zero; return it."""
+    """Check that a value is one finite pose `wxyz_xyz` with a unit quaternion, near the origin; return it."""
     if np.shape(value) != (7,):
         raise InputError(f"{function}: {name} has shape {np.shape(value)}; expected one pose wxyz_xyz, (7,)")
     if not traced(value):
         values = _array(function, name, value)
-        if not np.isfinite(values).all() or not np.linalg.norm(values[:4]) > 1e-6:
-            raise InputError(
-                f"{function}: {name} is {values.tolist()}; expected one finite pose wxyz_xyz, its quaternion not zero"
-            )
+        if not np.isfinite(values).all():
+            raise InputError(f"{function}: {name} is {values.tolist()}; expected one finite pose wxyz_xyz")
+        unit_quaternions(function, name, values[None])
+        near(function, name, values[None, 4:], value)
     return value
+
+
+def unit_quaternions(function: str, name: str, wxyz_xyz: np.ndarray) -> None:
+    """Check that the quaternions of poses `wxyz_xyz`, (poses, 7), have norm 1; the message names the likely order."""
+    norms = np.linalg.norm(wxyz_xyz[:, :4], axis=1)
+    off = np.abs(norms - 1)
+    if not (off > UNIT_NORM).any():
+        return
+    worst = int(off.argmax())
+    which = f"pose {worst} of {name}" if len(norms) > 1 else name
+    if (np.abs(np.linalg.norm(wxyz_xyz[:, 3:], axis=1) - 1) <= UNIT_NORM).all():
+        hint = (
+            "The last four numbers have norm 1, so the order is probably x y z qx qy qz qw, as in ROS: take "
+            "poses[..., [6, 3, 4, 5, 0, 1, 2]]; for x y z qw qx qy qz take poses[..., [3, 4, 5, 6, 0, 1, 2]]"
+        )
+    elif norms[worst] <= 1e-6:
+        hint = "A quaternion of zeros is no rotation"
+    else:
+        hint = "Check the order of the numbers, or divide each quaternion by its norm"
+    raise InputError(
+        f"{function}: {which} has a quaternion of norm {norms[worst]:.4g}; expected wxyz_xyz, qw qx qy qz of norm 1 "
+        f"and then x y z in metres. {hint}"
+    )
+
+
+def near(function: str, name: str, coordinates: np.ndarray, given=None) -> None:
+    """Check that coordinates, (rows, 3), metres, lie where float32 resolves them; float64 has no limit.
+
+    Args:
+        function: begins the message.
+        name: what the message calls them.
+        coordinates: finite coordinates.
+        given: value of the caller, whose type decides whether it is computed with in float64; by default
+            `coordinates`.
+    """
+    kind = np.asarray(coordinates if given is None else given).dtype
+    if jax.config.jax_enable_x64 and kind == np.float64:  # pyright: ignore[reportAttributeAccessIssue]
+        return
+    farthest = np.abs(coordinates).max(initial=0.0)
+    if farthest > FARTHEST:
+        raise InputError(
+            f"{function}: {name} has coordinates of up to {farthest:.6g} m; expected at most {FARTHEST:g} m from the "
+            "origin, because float32 does not resolve 0.1 mm there. Subtract one offset from all clouds and poses in "
+            "float64, such as offset = points.mean(axis=0), and add it to the resulting positions"
+        )
 
 
 def rotations(function: str, name: str, value: ArrayLike) -> ArrayLike:
@@ -158,8 +207,10 @@ def orientation(function: str, name: str, value: ArrayLike) -> np.ndarray | jax.
         raise InputError(f"{function}: {name} has shape {orientation.shape}; expected (3, 3), or (4,) as wxyz")
     if orientation.shape == (3, 3):
         rotations(function, name, orientation)
-    elif not traced(orientation) and not (np.isfinite(orientation).all() and orientation.any()):
-        raise InputError(f"{function}: {name} wxyz is {value}; expected a finite quaternion that is not zero")
+    elif not traced(orientation):
+        norm = np.linalg.norm(orientation)
+        if not abs(norm - 1) <= UNIT_NORM:  # NaN too
+            raise InputError(f"{function}: {name} is {value}, of norm {norm:.4g}; expected a quaternion of norm 1")
     return orientation
 
 
@@ -181,22 +232,23 @@ def points(function: str, value, name: str = "points"):
         name: what the message calls it.
 
     Returns:
-        The same array; a list as a numpy array, integers as float32.
+        The same array; a list as a numpy array, integers as float64.
 
     Raises:
-        InputError: the shape is not (points, 3), there are fewer than 21, one is not finite, or all are equal.
+        InputError: the shape is not (points, 3), there are fewer than 21, one is not finite, all are equal, or rows
+            are no measurements, see `invalid_rows`.
     """
     if not isinstance(value, jax.Array):
         try:
             value = np.asarray(value)
-        except ValueError as error:
+        except (TypeError, ValueError, RuntimeError) as error:
             raise InputError(f"{function}: {name} is not an array of numbers: {error}") from error
     if value.dtype.kind in "iu":
-        value = value.astype(np.float32)
+        value = value.astype(np.float32) if traced(value) else np.asarray(value, np.float64)
     if not jnp.issubdtype(value.dtype, np.floating):
         raise InputError(f"{function}: {name} has dtype {value.dtype}; expected floating point metres")
     if value.ndim != 2 or value.shape[1] != 3:
-        raise InputError(f"{function}: {name} has shape {value.shape}; expected (points, 3)")
+        raise InputError(f"{function}: {name} has shape {value.shape}; expected (points, 3){_transposed(value.shape)}")
     if len(value) < MINIMUM_POINTS:
         raise InputError(
             f"{function}: {name} has {len(value)} points; expected at least {MINIMUM_POINTS} "
@@ -209,13 +261,62 @@ def points(function: str, value, name: str = "points"):
     if bad:
         raise InputError(
             f"{function}: {bad} of the {len(values)} points of {name} are NaN or infinite; expected finite "
-            "metres. Remove them: points[np.isfinite(points).all(axis=1)]"
+            "metres. Remove them with tdf.drop_invalid(points), or --drop-invalid"
         )
     if not np.ptp(values, axis=0).any():
         raise InputError(
             f"{function}: the {len(values)} points of {name} are all equal to {values[0].tolist()}; expected a surface"
         )
+    repeated = repeated_rows(values)
+    if repeated:
+        rows = ", ".join(f"{count} are {list(map(float, row))}" for row, count in repeated)
+        raise InputError(
+            f"{function}: of the {len(values)} points of {name}, {rows}; expected measurements. Sensors and converters "
+            "write one value where they have none: remove such rows with tdf.drop_invalid(points), or --drop-invalid"
+        )
     return value
+
+
+def repeated_rows(values: np.ndarray) -> list[tuple[np.ndarray, int]]:
+    """Find the rows of a cloud that stand for missing measurements: one value, repeated far more often than others.
+
+    The origin stands for a missing measurement if it occurs twice, any other value if more than 1 % of the rows have
+    it. In merged and quantised clouds, and among the corners of triangles, many values occur several times. So a
+    value counts as repeated only if it is also at least twice as common as the fourth most common one.
+
+    Args:
+        values: finite points, (points, 3).
+
+    Returns:
+        Each such value with the number of its rows, the most common first.
+    """
+    values = np.ascontiguousarray(values) + 0  # 0 and -0 are one number
+    _, first, counts = np.unique(_row_hashes(values), return_index=True, return_counts=True)
+    usual = 2 * np.sort(counts)[-min(4, len(counts))] - 1
+    least = np.where(values[first].any(axis=1), max(SENTINEL_SHARE * len(values), 2, usual), usual)
+    chosen = np.flatnonzero(counts > least)
+    return [(values[first[i]], int(counts[i])) for i in chosen[np.argsort(-counts[chosen], kind="stable")]]
+
+
+def _row_hashes(values: np.ndarray) -> np.ndarray:
+    """One 64-bit number for each row; sorting these is far quicker than sorting rows."""
+    words = values.astype(np.float64).view(np.uint64)
+    hashes = np.zeros(len(values), np.uint64)
+    for column in words.T:
+        hashes = (hashes ^ column) * np.uint64(0x9E3779B97F4A7C15)
+        hashes ^= hashes >> np.uint64(29)
+    return hashes
+
+
+def _transposed(shape: tuple[int, ...]) -> str:
+    """The fix for the shapes that other libraries use."""
+    if len(shape) == 2 and shape[0] == 3:
+        return ". Transpose it: points.T"
+    if len(shape) == 3 and shape[-1] == 3:
+        return ". Flatten an organised cloud: points.reshape(-1, 3)"
+    if len(shape) == 2 and shape[1] > 3:
+        return ". Take the coordinates: points[:, :3], if they come first"
+    return ""
 
 
 def query(function: str, value) -> ArrayLike:

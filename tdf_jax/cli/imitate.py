@@ -23,7 +23,7 @@ from tdf_jax.energy.reference import describe
 from tdf_jax.evaluation.metrics import path_error, pose_error
 from tdf_jax.evaluation.scene import Scene
 from tdf_jax.geometry.trajectory import Trajectory
-from tdf_jax.imitation import imitate as imitate_scene
+from tdf_jax.imitation import DOUBT, imitate as imitate_scene
 from tdf_jax.io.trajectories import save_trajectory
 from tdf_jax.networks.checkpoint import load_model
 from tdf_jax.networks.model import Model
@@ -191,6 +191,8 @@ def _record(
         "demonstration": {
             "points": len(demonstration.points),
             "poses": demonstration.trajectory.num_poses,
+            "grasp": demonstration.grasp,
+            "release": demonstration.release,
             "queries": len(demonstration.query),
         },
         "target": {"points": len(scene.points), "T_world_target": scene.T_world_target.tolist()},
@@ -201,7 +203,7 @@ def _record(
         "recognised": _plain(float(result.recognised)),
         "modes": _modes(config, result),
         "errors": _errors(trajectory, expected),
-        "goal": _plain(trajectory.wxyz_xyz[-1]),
+        "goal": _plain(result.goal),
         "expected": None if expected is None else _plain(expected.wxyz_xyz),
         "energies": _plain(result.energies),
         "losses": _plain(result.candidate_history),
@@ -246,6 +248,10 @@ def _table(record: dict, out: Path) -> str:
         rows["recognised"] = f"{record['recognised']:.2f} that the object is of the demonstration's category"
     if record["confidence"] is not None:
         rows["confidence"] = f"{record['confidence']:.2f} that the pick is right to 2 cm and 20 degrees"
+        if record["confidence"] < DOUBT:
+            rows["what to do"] = (
+                "show the place to pick to the camera, remove other objects from the cloud, check weights"
+            )
     return "\n".join(f"{name:<17}{value}" for name, value in rows.items())
 
 
@@ -253,7 +259,7 @@ def _modes(config, result) -> list[dict] | None:
     """The distinct picks; None for methods that do not bring them to their minima."""
     if not isinstance(config, CarryConfig):
         return None
-    modes = cluster_poses(result.trajectories[:, 0], result.energies)
+    modes = cluster_poses(jax.numpy.asarray(result.picks), result.energies)
     return [{"pick": _plain(mode.pose), "energy": mode.energy, "share": mode.share} for mode in modes]
 
 

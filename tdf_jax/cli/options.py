@@ -15,7 +15,6 @@ from tdf_jax.evaluation.cases import QUERY_SIZE, Case, generated_case, place_dem
 from tdf_jax.evaluation.scene import Scene
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.query import box_query
-from tdf_jax.geometry.trajectory import resample
 from tdf_jax.io.demonstrations import load_demonstration
 from tdf_jax.io.meshes import load_mesh
 from tdf_jax.io.pointclouds import load_points
@@ -40,7 +39,7 @@ class SceneSettings:
         category: category of generated objects.
         trajectory: shape of a generated demonstration, from a mug's handle, a bowl's rim or a bottle's neck to a place
             0.30 m away; lift_over ends on a shelf there.
-        num_poses: number of poses of the trajectory; a demonstration file is resampled to another number.
+        num_poses: number of poses from the grasp to the release; a demonstration file is resampled to another number.
         queries: number of query points of a generated demonstration.
         points: number of points that are sampled from a mesh or a larger cloud.
         seed: seed of all random numbers.
@@ -261,10 +260,9 @@ def _read_demonstration(settings: SceneSettings) -> Demonstration | None:
     if settings.demonstration is None:
         return None
     demonstration = load_demonstration(settings.demonstration)
-    if settings.num_poses is None or settings.num_poses == demonstration.trajectory.num_poses:
+    if settings.num_poses is None or settings.num_poses == demonstration.transfer.num_poses:
         return demonstration
-    trajectory = resample(demonstration.trajectory, settings.num_poses)
-    return dataclasses.replace(demonstration, trajectory=trajectory)
+    return demonstration.resampled(settings.num_poses)
 
 
 def _read_target(settings: SceneSettings):

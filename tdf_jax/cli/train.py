@@ -11,6 +11,7 @@ from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.networks.checkpoint import SUFFIX, load_model, save_model
 from tdf_jax.networks.model import Model, ModelInfo
+from tdf_jax.training.batch import DIAGONALS
 from tdf_jax.training.config import TrainConfig
 from tdf_jax.training.dataset import Recipe, build, joined, load
 from tdf_jax.training.loop import steps_within, train as run
@@ -84,7 +85,10 @@ def train(
     save_figure(out / "training.png", training_figure(metrics(out)))
     origin = "" if start_from is None else f" from {start_from}"
     source = f"tdf train, {config.steps} steps{origin}, seed {config.seed}"
-    info = ModelInfo(name=target.stem, source=source, cloud_points=config.points)
+    smallest, largest = DIAGONALS
+    info = ModelInfo(
+        target.stem, source, cloud_points=config.points, smallest_diagonal=smallest, largest_diagonal=largest
+    )
     save_model(Model(params, config.network, info), target)
     print(f"saved {target}")
 

@@ -20,21 +20,33 @@ from tdf_jax.networks.model import Model
 COMBINATIONS = ("mean", "median")
 
 
-@functools.partial(jax.tree_util.register_dataclass, data_fields=["descriptors", "trajectory", "query"], meta_fields=[])
+def _no_poses() -> Array:
+    return jnp.zeros((0, 7))
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["descriptors", "trajectory", "query", "approach", "retreat"],
+    meta_fields=[],
+)
 @dataclasses.dataclass(frozen=True)
 class Reference:
     """Descriptors and poses of one or several demonstrations.
 
     Attributes:
         descriptors: phi of the demonstration, or the mean or median over demonstrations, (poses, queries, channels).
-        trajectory: poses T_object_query of the first demonstration, metres; the object frame has its origin at the
-            centroid of the demonstrated cloud and the axes of the world.
+        trajectory: poses T_object_query of the first demonstration from the grasp to the release, metres; the object
+            frame has its origin at the centroid of the demonstrated cloud and the axes of the world.
         query: query points, (queries, 3), metres, query frame.
+        approach: poses T_object_query before the grasp, (before, 7), `wxyz_xyz`; usually none.
+        retreat: poses T_object_query after the release, (after, 7); usually none.
     """
 
     descriptors: Float[Array, "poses queries channels"]
     trajectory: Trajectory
     query: Float[Array, "queries 3"]
+    approach: Float[Array, "before 7"] = dataclasses.field(default_factory=_no_poses)
+    retreat: Float[Array, "after 7"] = dataclasses.field(default_factory=_no_poses)
 
 
 def describe(model: Model, demonstrations: Demonstration | Sequence[Demonstration], combine: str = "mean") -> Reference:
@@ -42,7 +54,8 @@ def describe(model: Model, demonstrations: Demonstration | Sequence[Demonstratio
 
     Args:
         model: network that encodes the demonstrated objects.
-        demonstrations: one demonstration, or several with the same query points and number of poses.
+        demonstrations: one demonstration, or several with the same query points and number of poses from the grasp to
+            the release. The poses before and after are those of the first.
         combine: how the descriptors of several demonstrations are combined, channel by channel: "mean", as in NDF, or
             "median", which minimises the sum of absolute differences of eq. 2 (docs/results/benchmark.md compares
             them).
@@ -61,18 +74,30 @@ def describe(model: Model, demonstrations: Demonstration | Sequence[Demonstratio
         raise InputError(f"describe(): got {', '.join(kinds) or 'nothing'}; expected one or more of tdf.Demonstration")
     first = demonstrations[0]
     for other in demonstrations[1:]:
-        if other.trajectory.num_poses != first.trajectory.num_poses or not np.array_equal(other.query, first.query):
+        if other.transfer.num_poses != first.transfer.num_poses or not np.array_equal(other.query, first.query):
             raise InputError(
-                "describe(): demonstrations differ in their query points or number of poses; expected the same. "
-                "Use one set of query points, and resample() the trajectories"
+                "describe(): demonstrations differ in their query points or number of poses from the grasp to the "
+                "release; expected the same. Use one set of query points, and demonstration.resampled(num_poses)"
             )
     query = jnp.asarray(first.query)
     fields = [encode(model, demo.points) for demo in demonstrations]
-    several = [_describe(field, demo.trajectory, query) for field, demo in zip(fields, demonstrations)]
+    several = [_describe(field, demo.transfer, query) for field, demo in zip(fields, demonstrations)]
     descriptors = (
         sum(several[1:], several[0]) / len(several) if combine == "mean" else jnp.median(jnp.stack(several), axis=0)
     )
-    return Reference(descriptors, first.trajectory.shifted(-fields[0].origin), query)
+    transfer, approach, retreat = (
+        _relative(part.wxyz_xyz, fields[0].origin) for part in (first.transfer, first.approach, first.retreat)
+    )
+    return Reference(descriptors, Trajectory(transfer), query, approach, retreat)
+
+
+def _relative(wxyz_xyz, origin) -> Array:
+    """Poses relative to an origin; the difference is taken in float64 where the numbers are known."""
+    if checks.traced(wxyz_xyz, origin):
+        return Trajectory(wxyz_xyz).shifted(-origin).wxyz_xyz
+    poses = np.asarray(wxyz_xyz)
+    offset = np.concatenate([np.zeros(4), np.asarray(origin, np.float64)])
+    return jnp.asarray((poses - offset).astype(jax.dtypes.canonicalize_dtype(poses.dtype)))
 
 
 _describe = jax.jit(trajectory_descriptor)

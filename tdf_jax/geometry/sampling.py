@@ -1,12 +1,14 @@
-"""Point clouds sampled from a surface by area, and reduced by farthest-point sampling."""
+"""Point clouds sampled from a surface by area, reduced by farthest-point sampling, and freed of invalid rows."""
 
+import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from tdf_jax._internal import checks
-from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.deprecation import caller_level
+from tdf_jax._internal.errors import InputError, InvalidPointsWarning
 
 if TYPE_CHECKING:
     import trimesh
@@ -29,6 +31,49 @@ def thin(points: Float[np.ndarray, "points 3"], count: int) -> Float[np.ndarray,
     """
     indices = farthest_point_indices(points, count)
     return points if len(indices) == len(points) else points[indices]
+
+
+def drop_invalid(points: Float[np.ndarray, "*grid 3"]) -> Float[np.ndarray, "points 3"]:
+    """Remove the rows of a cloud that are no measurements.
+
+    Depth cameras and converters write NaN, infinity, (0, 0, 0) or another fixed value where they measured nothing. A
+    value counts as such a sentinel if more than 1 % of the rows have it, or if it is the origin and occurs more than
+    once, and if it is far more common than other values: duplicates in merged or quantised clouds stay.
+
+    Args:
+        points: point cloud, (points, 3), or organised as an image, (rows, columns, 3); any unit.
+
+    Returns:
+        The other rows in their order, (points, 3). An `InvalidPointsWarning` gives the numbers of those removed.
+
+    Raises:
+        InputError: the shape is wrong, these are no numbers, or no row is a measurement.
+    """
+    cloud = np.asarray(points)
+    if cloud.ndim not in (2, 3) or cloud.shape[-1] != 3 or cloud.dtype.kind not in "fiu":
+        raise InputError(
+            f"drop_invalid(): points have shape {cloud.shape} and dtype {cloud.dtype}; expected numbers, (points, 3) "
+            "or (rows, columns, 3)"
+        )
+    cloud = cloud.reshape(-1, 3)
+    finite = np.isfinite(cloud).all(axis=1)
+    kept = cloud[finite]
+    removed = {"NaN or infinite": len(cloud) - len(kept)}
+    for value, count in checks.repeated_rows(kept) if len(kept) else []:
+        kept = kept[(kept != value).any(axis=1)]
+        removed[str(value.tolist())] = count
+    if not len(kept):
+        raise InputError(
+            f"drop_invalid(): none of the {len(cloud)} rows is a measurement; check the sensor or the file"
+        )
+    if len(kept) < len(cloud):
+        counts = ", ".join(f"{count} are {value}" for value, count in removed.items() if count)
+        warnings.warn(
+            f"drop_invalid(): removed {len(cloud) - len(kept)} of {len(cloud)} points: {counts}",
+            InvalidPointsWarning,
+            stacklevel=caller_level(),
+        )
+    return kept
 
 
 def subsamples(points: Float[np.ndarray, "points 3"], count: int, times: int) -> Float[np.ndarray, "times count 3"]:

@@ -132,8 +132,8 @@ def check_trajectory(trajectory: Trajectory, name: str = "trajectory") -> Trajec
         The same trajectory.
 
     Raises:
-        InputError: the shape is not (poses, 7) with at least one pose, a number is not finite, or a quaternion has
-            length zero.
+        InputError: the shape is not (poses, 7) with at least one pose, a number is not finite, or the norm of a
+            quaternion differs from 1 by more than 1e-3, as in arrays of another order.
     """
     wxyz_xyz = trajectory.wxyz_xyz
     if not isinstance(wxyz_xyz, jax.Array | np.ndarray):
@@ -151,12 +151,7 @@ def check_trajectory(trajectory: Trajectory, name: str = "trajectory") -> Trajec
             raise InputError(
                 f"check_trajectory(): pose {np.argmin(finite)} of {name} is NaN or infinite; expected finite poses"
             )
-        norms = np.linalg.norm(values[:, :4], axis=1)
-        if not (norms > 1e-6).all():
-            raise InputError(
-                f"check_trajectory(): the quaternion of pose {np.argmin(norms)} of {name} has length "
-                f"{norms.min():.1e}; expected w x y z of a rotation, length 1"
-            )
+        checks.unit_quaternions("check_trajectory()", name, values)
     return trajectory
 
 

@@ -1,4 +1,4 @@
-"""Demonstrations in files: one .npz file of three arrays."""
+"""Demonstrations in files: one .npz file of named arrays."""
 
 import os
 import zipfile
@@ -9,32 +9,53 @@ import numpy as np
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory
 
 ARRAYS = ("points", "wxyz_xyz", "query")
+INDICES = {"grasp": 0, "release": -1}  # with the values that files without them have
+# Raised when a file holds what an older tdf_jax must not ignore, such as the target of a relation. Files without a
+# number are of schema 1.
+SCHEMA = 2
+# Diagonals of a cloud between which its unit may be metres: a grain of rice and a van.
+SMALLEST, LARGEST = 0.003, 10.0
+UNITS = {"millimetres": 0.001, "centimetres": 0.01}
+# Largest distance of the query points from the object at the grasp, diagonals of both. Remote query points are
+# legitimate, but descriptors fade with the distance (figure 3 of the paper).
+FARTHEST_GRASP = 2.0
 
 
 def save_demonstration(path: str | os.PathLike, demonstration: Demonstration) -> None:
     """Write a demonstration.
 
     Args:
-        path: .npz file in an existing folder. It holds three arrays: `points`, the object point cloud, (points, 3),
-            metres, world frame; `wxyz_xyz`, the poses T_world_query from the pick to the place, (poses, 7); `query`,
-            the query points, (queries, 3), metres, query frame.
+        path: .npz file in an existing folder. It holds the arrays `points`, the object point cloud before the grasp,
+            (points, 3), metres, world frame; `wxyz_xyz`, the poses T_world_query, (poses, 7); `query`, the query
+            points, (queries, 3), metres, query frame; and the integers `grasp` and `release`, the indices of the poses
+            at which the object is grasped and released, and `schema`.
         demonstration: demonstration to write.
 
     Raises:
         InputError: the suffix is not .npz, or the file cannot be written.
     """
     path = _npz("save_demonstration()", path)
-    points, query = np.asarray(demonstration.points), np.asarray(demonstration.query)
-    wxyz_xyz = np.asarray(demonstration.trajectory.wxyz_xyz)
-    replace_file("save_demonstration", path, lambda file: np.savez(file, points=points, wxyz_xyz=wxyz_xyz, query=query))
+    arrays = {
+        "points": np.asarray(demonstration.points),
+        "wxyz_xyz": np.asarray(demonstration.trajectory.wxyz_xyz),
+        "query": np.asarray(demonstration.query),
+        "grasp": np.int64(demonstration.grasp),
+        "release": np.int64(demonstration.release),
+        "schema": np.int64(SCHEMA),
+    }
+    replace_file("save_demonstration", path, lambda file: np.savez(file, **arrays))
 
 
 def load_demonstration(path: str | os.PathLike) -> Demonstration:
-    """Read a demonstration that `save_demonstration` wrote, or any .npz file of the same three arrays.
+    """Read a demonstration that `save_demonstration` wrote, or any .npz file with its first three arrays.
+
+    Units and frames are checked as far as the numbers show them: the cloud has the size of an object in metres, and
+    the query points at the grasp lie at the object.
 
     Args:
         path: .npz file.
@@ -43,27 +64,98 @@ def load_demonstration(path: str | os.PathLike) -> Demonstration:
         The demonstration, float32.
 
     Raises:
-        InputError: the file is missing or unreadable, an array is missing, or the arrays are not a demonstration.
+        InputError: the file is missing, unreadable or of a newer tdf_jax, an array is missing, the arrays are not a
+            demonstration, or its unit or frames are wrong.
     """
     path = _npz("load_demonstration()", path)
     if not path.is_file():
         raise InputError(f"load_demonstration(): there is no file {path}; check the path")
     try:
         with path.open("rb") as file, np.lib.npyio.NpzFile(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in ARRAYS if name in archive}
+            names = (*ARRAYS, *INDICES, "schema")
+            arrays = {name: archive[name] for name in names if name in archive}
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
         raise InputError(f"load_demonstration(): {path} cannot be read as .npz ({error}); save it again") from None
-    if len(arrays) < len(ARRAYS):
-        absent = ", ".join(name for name in ARRAYS if name not in arrays)
+    absent = ", ".join(name for name in ARRAYS if name not in arrays)
+    if absent:
         raise InputError(f"load_demonstration(): {path} has no array {absent}; expected {', '.join(ARRAYS)}")
     for name, array in arrays.items():
         if array.dtype.kind not in "fiu":
             raise InputError(f"load_demonstration(): {name} in {path} has dtype {array.dtype}; expected numbers")
-    points, wxyz_xyz, query = (arrays[name].astype(np.float32) for name in ARRAYS)
+    integers = INDICES | {"schema": 1}
+    for name in integers.keys() & arrays.keys():
+        if arrays[name].shape != () or arrays[name].dtype.kind not in "iu":
+            raise InputError(f"load_demonstration(): {name} in {path} is {arrays[name]}; expected one integer")
+        integers[name] = int(arrays[name])
+    if not 1 <= integers.pop("schema") <= SCHEMA:
+        raise InputError(
+            f"load_demonstration(): {path} has schema {arrays['schema']}; expected 1 to {SCHEMA}. Use the tdf_jax that "
+            "wrote it, or a newer one"
+        )
+    points, wxyz_xyz, query = (arrays[name].astype(np.float64) for name in ARRAYS)
     try:
-        return Demonstration(points, Trajectory(jnp.asarray(wxyz_xyz)), query)  # pyright: ignore[reportArgumentType]
+        # Checked in float64, because far coordinates and bad norms would be rounded away.
+        demonstration = Demonstration(points, Trajectory(wxyz_xyz), query, **integers)  # pyright: ignore[reportArgumentType]
+        check_frames("load_demonstration()", demonstration)
     except InputError as error:
         raise InputError(f"load_demonstration(): {path}: {error}") from None
+    trajectory = Trajectory(jnp.asarray(wxyz_xyz, jnp.float32))
+    return Demonstration(points.astype(np.float32), trajectory, query.astype(np.float32), **integers)
+
+
+def check_frames(function: str, demonstration: Demonstration) -> None:
+    """Check that a demonstration's unit can be metres, and that its query points are at the object at the grasp.
+
+    Args:
+        function: name that the messages begin with.
+        demonstration: demonstration to check.
+
+    Raises:
+        InputError: the cloud is smaller or larger than any object, or the query points are far from it; the message
+            names the unit or the frame that would explain it.
+    """
+    points, query = np.asarray(demonstration.points, float), np.asarray(demonstration.query, float)
+    grasp = np.asarray(demonstration.trajectory.wxyz_xyz, float)[demonstration.grasp]
+    diagonal = _diagonal(points)
+    if not SMALLEST <= diagonal <= LARGEST:
+        unit = next((unit for unit, metres in UNITS.items() if 0.05 <= diagonal * metres <= 1), None)
+        hint = f"It is probably in {unit}: multiply it by {UNITS[unit]:g}" if unit else "Check its unit"
+        raise InputError(
+            f"{function}: the cloud has a diagonal of {diagonal:.3g} m; expected an object in metres. {hint}"
+        )
+    reach = FARTHEST_GRASP * (diagonal + _diagonal(query))
+    gap = _gap(points, grasp, query)
+    if gap <= reach:
+        return
+    inverse = np.asarray(se3.inverse(jnp.asarray(grasp)), float)
+    explanations = {"the poses are probably T_query_world: invert them": (points, inverse)}
+    for unit, metres in UNITS.items():
+        smaller = np.concatenate([grasp[:4], metres * grasp[4:]])
+        explanations[f"the cloud is probably in {unit}: multiply it by {metres:g}"] = (metres * points, grasp)
+        explanations[f"the positions are probably in {unit}: multiply them by {metres:g}"] = (points, smaller)
+    hint = next(
+        (
+            text
+            for text, (cloud, pose) in explanations.items()
+            if _diagonal(cloud) >= 0.02
+            and _gap(cloud, pose, query) <= FARTHEST_GRASP / 2 * (_diagonal(cloud) + _diagonal(query))
+        ),
+        "check that cloud and poses are in one frame and in metres, and that grasp is the index of the grasp",
+    )
+    raise InputError(
+        f"{function}: at the grasp, pose {demonstration.grasp}, the query points are {gap:.3g} m from the object, "
+        f"whose diagonal is {diagonal:.3g} m; expected them at the object; {hint}"
+    )
+
+
+def _diagonal(points: np.ndarray) -> float:
+    return float(np.linalg.norm(np.ptp(points, axis=0)))
+
+
+def _gap(points: np.ndarray, wxyz_xyz: np.ndarray, query: np.ndarray) -> float:
+    """Distance from the centroid of the query points, carried by a pose, to the nearest point."""
+    centroid = np.asarray(se3.transform(jnp.asarray(wxyz_xyz), jnp.asarray(query.mean(axis=0)[None])))[0]
+    return float(np.linalg.norm(points - centroid, axis=1).min())
 
 
 def _npz(function: str, path: str | os.PathLike) -> Path:

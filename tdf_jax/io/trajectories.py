@@ -1,5 +1,6 @@
-"""Trajectories in files: .npz, and the text format of TUM."""
+"""Trajectories in files: .npz, the text format of TUM, and .csv with named columns."""
 
+import re
 import zipfile
 from pathlib import Path
 from typing import BinaryIO
@@ -7,6 +8,7 @@ from typing import BinaryIO
 import jax.numpy as jnp
 import numpy as np
 
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
 from tdf_jax.geometry.trajectory import Trajectory, check_trajectory
@@ -22,11 +24,11 @@ def save_trajectory(path: str | Path, trajectory: Trajectory) -> None:
     Raises:
         InputError: the suffix is unknown, the file cannot be written, or the trajectory fails `check_trajectory`.
     """
-    path = _known_suffix("save_trajectory()", path)
+    path = _known_suffix("save_trajectory()", path, (".npz", ".tum"))
     wxyz_xyz = np.asarray(check_trajectory(trajectory).wxyz_xyz)
 
     def write(file: BinaryIO) -> None:
-        if path.suffix == ".npz":
+        if path.suffix.lower() == ".npz":
             np.savez(file, wxyz_xyz=wxyz_xyz)
         else:
             digits = np.finfo(wxyz_xyz.dtype).precision + 3  # enough digits to read the same bits
@@ -37,28 +39,35 @@ def save_trajectory(path: str | Path, trajectory: Trajectory) -> None:
 
 
 def load_trajectory(path: str | Path) -> Trajectory:
-    """Read a trajectory written by `save_trajectory`, or another program's .tum file.
+    """Read a trajectory written by `save_trajectory`, or another program's .tum or .csv file.
 
     Args:
-        path: .npz or .tum file. The lines of a .tum file are poses in order; timestamps are ignored, and # starts a
-            comment.
+        path: .npz, .tum or .csv file. The lines of a .tum file are poses in order; timestamps are ignored, and # starts
+            a comment. The first line of a .csv file names its columns, of which x, y, z, qx, qy, qz and qw are read, in
+            any order; separators are commas, semicolons, tabs or spaces.
 
     Returns:
         The trajectory.
 
     Raises:
-        InputError: the file is missing or unreadable, or its poses fail `check_trajectory`.
+        InputError: the file is missing, unreadable or of another dialect, its poses fail `check_trajectory`, or they
+            are farther from the origin than float32 resolves.
     """
-    path = _known_suffix("load_trajectory()", path)
+    path = _known_suffix("load_trajectory()", path, tuple(_READERS))
     if not path.is_file():
         raise InputError(f"load_trajectory(): there is no file {path}; expected an existing file; check the path")
     try:
-        wxyz_xyz = _READERS[path.suffix](path)
+        wxyz_xyz = _READERS[path.suffix.lower()](path)
+    except _Dialect as reason:
+        raise InputError(f"load_trajectory(): {path} is not read: {reason}") from None
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
         raise InputError(
             f"load_trajectory(): {path} cannot be read as {path.suffix} ({error}); save it again"
         ) from error
-    return check_trajectory(Trajectory(jnp.asarray(wxyz_xyz)), str(path))
+    # In numpy, because far coordinates and bad norms must be seen before they are rounded.
+    check_trajectory(Trajectory(wxyz_xyz), str(path))  # pyright: ignore[reportArgumentType]
+    checks.near("load_trajectory()", str(path), wxyz_xyz[:, 4:])
+    return Trajectory(jnp.asarray(wxyz_xyz))
 
 
 def _read_npz(path: Path) -> np.ndarray:
@@ -72,18 +81,50 @@ def _read_npz(path: Path) -> np.ndarray:
 
 
 def _read_tum(path: Path) -> np.ndarray:
-    lines = [line for line in path.read_text().splitlines() if line.split("#")[0].strip()]
+    lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    for line in lines:
+        names = [word.lower() for word in re.split(r"[\s,;]+", line.partition("#")[2]) if word]
+        quaternion = [name for name in names if name in ("qw", "qx", "qy", "qz")]
+        if len(quaternion) == 4 and quaternion != ["qx", "qy", "qz", "qw"]:
+            raise _Dialect(
+                f"its comment names the order {' '.join(quaternion)}; expected TUM's, qx qy qz qw at the end"
+            )
+    lines = [line for line in lines if line.split("#")[0].strip()]
     rows = np.loadtxt(lines, ndmin=2) if lines else np.zeros((0, 8))
     if rows.shape[1] != 8:
-        raise ValueError(f"it has {rows.shape[1]} columns; expected the 8 of t x y z qx qy qz qw")
+        raise _Dialect(f"it has {rows.shape[1]} columns; expected the 8 of t x y z qx qy qz qw")
     return rows[:, [7, 4, 5, 6, 1, 2, 3]]
 
 
-_READERS = {".npz": _read_npz, ".tum": _read_tum}
+def _read_csv(path: Path) -> np.ndarray:
+    lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    lines = [line.strip() for line in lines if line.strip()]
+    separator = next((mark for mark in (";", "\t", ",") if lines and mark in lines[0]), None)
+    names = [name.strip(" \"'#").lower() for name in (lines[0].split(separator) if lines else [])]
+    missing = [name for name in COLUMNS if name not in names]
+    if missing:
+        raise _Dialect(f"its first line names no column {', '.join(missing)}; expected {', '.join(COLUMNS)}")
+    repeated = [name for name in COLUMNS if names.count(name) > 1]
+    if repeated:
+        raise _Dialect(f"its first line names {', '.join(repeated)} more than once; expected each column once")
+    rows = [line.split(separator) for line in lines[1:]]
+    for number, row in enumerate(rows, 2):
+        if len(row) != len(names):
+            raise _Dialect(f"line {number} has {len(row)} values; expected {len(names)}, as the first line names")
+    columns = [names.index(name) for name in COLUMNS]
+    return np.array([[float(row[column]) for column in columns] for row in rows]).reshape(-1, 7)
 
 
-def _known_suffix(function: str, path: str | Path) -> Path:
+class _Dialect(Exception):
+    """What an undamaged file has that is not read."""
+
+
+COLUMNS = ("qw", "qx", "qy", "qz", "x", "y", "z")
+_READERS = {".npz": _read_npz, ".tum": _read_tum, ".csv": _read_csv}
+
+
+def _known_suffix(function: str, path: str | Path, suffixes: tuple[str, ...]) -> Path:
     path = Path(path)
-    if path.suffix not in _READERS:
-        raise InputError(f"{function}: {path} has suffix {path.suffix!r}; expected {' or '.join(_READERS)}")
+    if path.suffix.lower() not in suffixes:
+        raise InputError(f"{function}: {path} has suffix {path.suffix!r}; expected {' or '.join(suffixes)}")
     return path

@@ -19,12 +19,16 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from tdf_jax._internal.cache import digest
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
-from tdf_jax.networks.model import Model, ModelInfo, shape_problems, value_problems
+from tdf_jax.networks.model import NDF_SIZES, Model, ModelInfo, shape_problems, value_problems
 from tdf_jax.networks.occupancy import FORMER_FIELDS, NetworkConfig, parameter_shapes
 
 SUFFIX = ".safetensors"
-SCHEMA = 2  # rises if an older tdf_jax cannot read the files that are written here
-READABLE_SCHEMAS = (1, SCHEMA)  # files of schema 1 have the names in `FORMER_FIELDS`
+SCHEMA = 3  # rises if an older tdf_jax cannot read the files that are written here
+# Files of schema 1 have the names in `FORMER_FIELDS`; files of schemas 1 and 2 do not have the sizes of the training
+# objects.
+READABLE_SCHEMAS = (1, 2, SCHEMA)
+# Smallest and largest diagonal of the training objects of such files, metres, by the beginning of their source.
+FORMER_SIZES = {"tdf train": (0.08, 0.5), "converted from": NDF_SIZES}
 # All metadata are under one key because safetensors writes several keys in random order, and equal models should give
 # equal files.
 METADATA_KEY = "tdf_jax"
@@ -85,7 +89,7 @@ def load_model(name_or_path: str | os.PathLike) -> Model:
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             header = _header(file.metadata())
-            config, info = _record(NetworkConfig, _sizes(header)), _record(ModelInfo, header["info"])
+            config, info = _record(NetworkConfig, _sizes(header)), _record(ModelInfo, _info(header))
             slices = {name: file.get_slice(name) for name in file.keys()}
             _check_shapes({name: tuple(part.get_shape()) for name, part in slices.items()}, config)
             _check_types({name: part.get_dtype() for name, part in slices.items()}, "F32")
@@ -172,6 +176,16 @@ def _sizes(header: Mapping) -> Mapping:
     return {FORMER_FIELDS.get(name, name): value for name, value in header["config"].items()}
 
 
+def _info(header: Mapping) -> Mapping:
+    """The header's origin of the network, with the sizes of the training objects where they are known."""
+    info = header["info"]
+    if header["schema"] > 2 or not isinstance(info, Mapping):
+        return info
+    source = str(info.get("source", ""))
+    sizes = next((sizes for start, sizes in FORMER_SIZES.items() if source.startswith(start)), (None, None))
+    return {"smallest_diagonal": sizes[0], "largest_diagonal": sizes[1], **info}
+
+
 def _record(kind: type, values: Mapping):
     """Build a dataclass from JSON values; check the type of each. An integer may stand for a float."""
     try:
@@ -182,7 +196,7 @@ def _record(kind: type, values: Mapping):
         raise _Refusal(f"its {error}") from None
     for field in dataclasses.fields(kind):
         value = getattr(record, field.name)
-        kinds = int | float if field.type is float else cast(type, field.type)
+        kinds = {float: int | float, float | None: int | float | None}.get(field.type, cast(type, field.type))
         if isinstance(value, bool) or not isinstance(value, kinds):
             raise _Refusal(f"its {kind.__name__}.{field.name} is a {type(value).__name__}; expected {field.type}")
     return record

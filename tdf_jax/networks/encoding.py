@@ -1,6 +1,7 @@
 """Encoding: from the point cloud of an object to its descriptor field."""
 
 import functools
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -8,12 +9,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from tdf_jax._internal import checks
-from tdf_jax._internal.deprecation import renamed_keywords
-from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.deprecation import caller_level, renamed_keywords
+from tdf_jax._internal.errors import InputError, SizeWarning
 from tdf_jax._internal.precision import full_precision
 from tdf_jax.geometry import sampling
 from tdf_jax.networks.field import DescriptorField
-from tdf_jax.networks.model import Model
+from tdf_jax.networks.model import Model, ModelInfo
 from tdf_jax.networks.occupancy import condition, encode_latent
 
 CENTRED = 1e-7  # share of a cloud's extent; a smaller mean is float32's rounding
@@ -22,6 +23,10 @@ NUM_SUBSAMPLES = 8  # 16 subsamples raise the IoU by another 0.003
 # Radians. Latents of subsamples of one mug are rotated against each other by 1 to 2 degrees, those of symmetric objects
 # by 60 to 90 on average.
 SAME_SIDE = np.pi / 6
+# A cloud of one side of an object is up to two times smaller than the object, and an object in another orientation has
+# another bounding box; a wrong unit is a factor of 39 or more.
+SIZE_TOLERANCE = 3.0
+UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254}
 
 
 @renamed_keywords(thinnings="num_subsamples")
@@ -46,8 +51,12 @@ def encode(
         from the centroid.
 
     Raises:
-        InputError: the points are fewer than 21 or than the network's neighbours, not (points, 3), not finite or all
-            equal; `num_subsamples` is negative; or the points are denser than the network's and traced by `jax.jit`.
+        InputError: the points are fewer than 21 or than the network's neighbours, not (points, 3), not finite, all
+            equal, no measurements, or farther from the origin than float32 resolves; `num_subsamples` is negative; or
+            the points are denser than the network's and traced by `jax.jit`.
+
+    Warns:
+        SizeWarning: the cloud is far smaller or larger than the objects that the network was trained on.
     """
     cloud, density = checks.points("encode()", points), model.info.cloud_points
     num_subsamples = checks.count("encode()", "num_subsamples", num_subsamples, 0)
@@ -64,22 +73,63 @@ def encode(
             f"encode(): {len(cloud)} points cannot be subsampled to {count} under jax.jit; expected that many. "
             "Subsample the cloud outside with tdf.thin, or pass num_subsamples=0"
         )
-    whole = cloud if traced else np.asarray(cloud)
+    if traced:
+        return _average(model.params, model.config, cloud[None], _anchor(cloud), jnp.zeros_like(cloud[0]))
+    whole, shift = _centred(np.asarray(cloud))
+    _warn_of_size(model.info, whole)
     # All subsamples share one anchor, so that they see the same side of a symmetric object as its front.
-    anchor = whole[((whole - whole.mean(axis=0)) ** 2).sum(axis=1).argmax()]
-    clouds = sampling.subsamples(np.asarray(whole), count, num_subsamples) if dense else cloud[None]
-    if traced or checks.traced(model.params):
-        return _average(model.params, model.config, clouds, anchor)
+    anchor = _anchor(whole)
+    clouds = sampling.subsamples(whole, count, num_subsamples) if dense else whole[None]
+    if checks.traced(model.params):
+        return _average(model.params, model.config, clouds, anchor, shift)
     num_clouds, size = clouds.shape[:2]
     # Padding with clouds and points that do not count lets clouds of many sizes run one program.
     padded = (1, -(-size // PADDING) * PADDING) if plain else (num_subsamples, count)
     clouds = np.resize(clouds, (*padded, 3))
-    return _encode(model.params, model.config, clouds, np.int32(num_clouds), np.int32(size), anchor)
+    return _encode(model.params, model.config, clouds, np.int32(num_clouds), np.int32(size), anchor, shift)
+
+
+def _centred(cloud):
+    """The cloud relative to its mean, and the mean; the difference is taken in float64, before any rounding."""
+    checks.near("encode()", "points", cloud)
+    dtype = np.promote_types(jax.dtypes.canonicalize_dtype(cloud.dtype), np.float32)
+    shift = cloud.mean(axis=0, dtype=np.float64)
+    # See `_latent`: a cloud that counts as centred stays as it is.
+    shift = np.where(np.abs(shift).max() <= CENTRED * np.ptp(cloud, axis=0).max(), 0.0, shift)
+    return (cloud - shift).astype(dtype), shift.astype(dtype)
+
+
+def _anchor(cloud):
+    """The point that is the farthest from the mean."""
+    return cloud[((cloud - cloud.mean(axis=0)) ** 2).sum(axis=1).argmax()]
+
+
+def _warn_of_size(info: ModelInfo, cloud: np.ndarray) -> None:
+    """Warn if a cloud is so small or so large that its unit is probably wrong."""
+    if info.smallest_diagonal is None or info.largest_diagonal is None:
+        return
+    diagonal = float(np.linalg.norm(np.ptp(cloud, axis=0)))
+    least, most = info.smallest_diagonal / SIZE_TOLERANCE, info.largest_diagonal * SIZE_TOLERANCE
+    if least <= diagonal <= most:
+        return
+    likely = next((unit for unit, metres in UNITS.items() if least <= diagonal * metres <= most), None)
+    advice = "check its unit, and whether it holds the object alone"
+    if likely is not None:
+        advice = f"it is probably in {likely}: multiply it by {UNITS[likely]:g}, or give --scale {UNITS[likely]:g}"
+    warnings.warn(
+        f"encode(): the bounding box of the cloud has a diagonal of {diagonal:.4g} m, and the weights {info.name!r} "
+        f"were trained on objects of {info.smallest_diagonal:g} to {info.largest_diagonal:g} m; {advice}",
+        SizeWarning,
+        stacklevel=caller_level(),
+    )
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _encode(params, config, clouds, num_clouds, size, anchor):
-    """The field averaged over the first `num_clouds` clouds, of their first `size` points; the rest is padding."""
+def _encode(params, config, clouds, num_clouds, size, anchor, shift):
+    """The field averaged over the first `num_clouds` clouds, of their first `size` points; the rest is padding.
+
+    Clouds and anchor are relative to `shift`, which is in the world frame.
+    """
     used = jnp.arange(clouds.shape[1]) < size
 
     def fill(index, state):
@@ -98,18 +148,18 @@ def _encode(params, config, clouds, num_clouds, size, anchor):
     consistent = consistent_latents(latents, jnp.arange(len(clouds)) < num_clouds)
     sums = jax.lax.fori_loop(0, num_clouds, add, jax.tree.map(lambda all: jnp.zeros_like(all[0]), blank))
     latent, origin = (part / jnp.sum(consistent) for part in sums)
-    return DescriptorField(condition(params, config, latent), origin)
+    return DescriptorField(condition(params, config, latent), origin + shift)
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _average(params, config, clouds, anchor):
+def _average(params, config, clouds, anchor, shift):
     """The same of all points of all clouds; its loops have known lengths, so it has a reverse-mode derivative."""
     latents, origins = jax.lax.map(lambda points: _latent(params, config, points, anchor), clouds)
     consistent = consistent_latents(jax.lax.stop_gradient(latents), jnp.ones(len(clouds), bool))
     latent, origin = (
         jnp.mean(all, axis=0, where=consistent[:, *[None] * (all.ndim - 1)]) for all in (latents, origins)
     )
-    return DescriptorField(condition(params, config, latent), origin)
+    return DescriptorField(condition(params, config, latent), origin + shift)
 
 
 @full_precision

@@ -11,6 +11,10 @@ import numpy as np
 from tdf_jax._internal.cache import digest
 from tdf_jax.networks.occupancy import FORMER_FIELDS, NetworkConfig
 
+# Diagonals of the objects that the published networks of Neural Descriptor Fields were trained on, metres: ShapeNet's
+# models, whose diagonal is 1, scaled by 0.2 to 0.5.
+NDF_SIZES = (0.2, 0.5)
+
 
 @dataclasses.dataclass(frozen=True)
 class ModelInfo:
@@ -21,12 +25,17 @@ class ModelInfo:
         source: training run that made it, or file that it was converted from.
         cloud_points: points of the farthest-point subsamples that it was trained on; None if unknown.
         description: further remarks.
+        smallest_diagonal: smallest bounding-box diagonal of the objects that it was trained on, metres; None if
+            unknown.
+        largest_diagonal: largest such diagonal, metres; None if unknown.
     """
 
     name: str
     source: str
     cloud_points: int | None = None
     description: str = ""
+    smallest_diagonal: float | None = None
+    largest_diagonal: float | None = None
 
 
 @functools.partial(jax.tree_util.register_dataclass, data_fields=["params"], meta_fields=["config", "info"])

@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import unflatten_dict
 
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.errors import InputError
-from tdf_jax.networks.model import Model, ModelInfo, shape_problems, value_problems
+from tdf_jax.networks.model import NDF_SIZES, Model, ModelInfo, shape_problems, value_problems
 from tdf_jax.networks.occupancy import NetworkConfig, parameter_shapes
 from tdf_jax.networks.torch_pickle import STORAGE_LIMIT, Refusal, Tensor, interpret
 
@@ -27,6 +28,7 @@ WRAPPERS = ("state_dict", "model_state_dict", "model")  # keys under which train
 RESAVE = 'if you trust it, re-save it with PyTorch: torch.save(torch.load(p, map_location="cpu"), new)'
 
 
+@public
 def convert_checkpoint(path: str | os.PathLike, name: str | None = None) -> Model:
     """Convert a PyTorch checkpoint of the published layout (`ndf_robot`'s `VNNOccNet`); the latent size is inferred.
 
@@ -50,7 +52,9 @@ def convert_checkpoint(path: str | os.PathLike, name: str | None = None) -> Mode
     except Refusal as reason:
         raise InputError(f"convert_checkpoint(): refused to load {path}: {reason}") from None
     source = f"converted from the PyTorch checkpoint {path.name}"
-    return Model(params, config, ModelInfo(name=path.stem if name is None else name, source=source))
+    smallest, largest = NDF_SIZES
+    info = ModelInfo(path.stem if name is None else name, source, smallest_diagonal=smallest, largest_diagonal=largest)
+    return Model(params, config, info)
 
 
 def _convert(archive: zipfile.ZipFile) -> tuple[NetworkConfig, dict]:

@@ -16,13 +16,14 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from tdf_jax._internal import checks, devices
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.deprecation import renamed_fields, renamed_keywords
 from tdf_jax.energy.losses import EnergyWeights, pose_energy, waypoint_loss
 from tdf_jax.energy.reference import Reference
 from tdf_jax.geometry import se3
 from tdf_jax.networks.field import DescriptorField
 from tdf_jax.solvers.initial import STARTS, prepare
-from tdf_jax.solvers.result import Result
+from tdf_jax.solvers.result import Result, with_ends
 
 # 512 descriptors of 2049 numbers are 4 MB, which are meant to stay in cache. Other sizes were not compared.
 CHUNK_POINTS = 512
@@ -77,6 +78,7 @@ class OptimizeConfig:
         return self.iterations
 
 
+@public
 @renamed_keywords(mesh="device_mesh")
 def optimize(
     field: DescriptorField,
@@ -100,14 +102,14 @@ def optimize(
         field: descriptor field of the new object.
         reference: the demonstration.
         key: random key of the starts.
-        goal: last pose of every start, (7,), T_world_query; by default, with `fix_last`, the demonstration's last pose,
+        goal: pose of every start at the release, (7,), T_world_query; by default, with `fix_last`, the demonstration's,
             moved by the centroids.
         fix_last: keep the last pose at the goal. Otherwise it is free, and starts at the goal or, without one, at
             random like the others.
         energy: weights of the energy's terms.
         config: settings.
-        starts: initial trajectories that replace the random ones, (starts, poses, 7), T_world_query. A goal that is
-            given replaces their last poses.
+        starts: initial trajectories from the grasp to the release that replace the random ones, (starts, poses, 7),
+            T_world_query. A goal that is given replaces their last poses.
         progress: function that is called between blocks of iterations with the number of iterations so far and the
             energies. It may raise to cancel.
         device_mesh: devices that share the starts, of this process or of several that make the same call.
@@ -122,7 +124,7 @@ def optimize(
     checked, energy = prepare(
         "optimize()", field, reference, key, goal, fix_last, energy, config, starts, device_mesh, config.num_starts
     )
-    num_starts, dtype = len(checked), checked.dtype
+    num_starts, dtype, demonstrated = len(checked), checked.dtype, reference
     initial = jnp.asarray(checked)
     count = config.chunk_poses or max(1, devices.points_at_a_time(CHUNK_POINTS) // len(reference.query))
     program = functools.partial(_run, fix_last=fix_last, chunk=count, device_mesh=device_mesh)
@@ -144,9 +146,10 @@ def optimize(
     history = jnp.concatenate(losses, axis=1)
     result = Result(trajectories, block[:, 0], history, initial, history)
     if device_mesh is None:
-        return result
+        return with_ends(result, reference)
     # Fields that are unknown are scalars of this process.
-    return jax.tree.map(lambda part: jnp.asarray(devices.gathered(part)[:num_starts]) if part.ndim else part, result)
+    result = jax.tree.map(lambda part: jnp.asarray(devices.gathered(part)[:num_starts]) if part.ndim else part, result)
+    return with_ends(result, demonstrated)
 
 
 @jax.jit

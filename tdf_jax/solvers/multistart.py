@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from tdf_jax._internal import checks, devices
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.deprecation import renamed_fields, renamed_keywords
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import EnergyWeights
@@ -33,7 +34,7 @@ from tdf_jax.geometry import se3
 from tdf_jax.networks.field import DescriptorField
 from tdf_jax.solvers import gauss_newton
 from tdf_jax.solvers.initial import STARTS, prepare
-from tdf_jax.solvers.result import Result
+from tdf_jax.solvers.result import Result, with_ends
 
 # Query points whose descriptors and three tangents exist at a time, 4 MB. With 500 query points, a chunk of 512 took
 # twice as long a point on a CPU with 2 MB of second-level cache a core.
@@ -135,6 +136,7 @@ class Candidates(NamedTuple):
     history: Float[np.ndarray, "times rows free"] = np.empty((0, 0, 0))
 
 
+@public
 @renamed_keywords(mesh="device_mesh")
 def solve(
     field: DescriptorField,
@@ -159,8 +161,8 @@ def solve(
         fix_last: keep the last pose at the goal, see `optimize`.
         energy: weights of the energy's terms.
         config: settings.
-        starts: initial trajectories that replace the random ones, (starts, poses, 7), T_world_query; both the coarse
-            and the search stage take all of them.
+        starts: initial trajectories from the grasp to the release that replace the random ones, (starts, poses, 7),
+            T_world_query; both the coarse and the search stage take all of them.
         progress: function that is called after each stage with the number of steps so far and the energies of the best
             candidates, on the query points of the stage and without a fixed last pose (of the keyframe alone in the
             first two stages). It may raise to cancel.
@@ -261,7 +263,7 @@ def solve(
     losses = losses.T.astype(initial.dtype)
     free_poses = _poses(ordered, problem)
     ends = np.broadcast_to(initial[:1, free:], (len(free_poses), n - free, 7))
-    return Result(
+    result = Result(
         trajectories=jnp.asarray(np.concatenate([free_poses, ends], axis=1)),
         energies=jnp.asarray(losses[:, -1]),
         candidate_history=jnp.asarray(losses[:, :-1]),
@@ -269,6 +271,7 @@ def solve(
         # It stays in numpy: under `jax_debug_nans` an array of jax must not hold NaN.
         history=_history(followed, len(initial), losses.shape[1] - 1, fixed, n).astype(initial.dtype),
     )
+    return with_ends(result, reference)
 
 
 def _history(followed, num_starts, length, fixed, n):

@@ -25,7 +25,7 @@ from tdf_jax.geometry.transport import carry_to_picks
 from tdf_jax.networks.field import DescriptorField
 from tdf_jax.solvers.initial import default_goal
 from tdf_jax.solvers.multistart import SolveConfig, check_stage_settings, solve
-from tdf_jax.solvers.result import Result
+from tdf_jax.solvers.result import Result, with_ends
 
 
 @renamed_fields(
@@ -104,7 +104,7 @@ def carry(
         field: descriptor field of the new object.
         reference: the demonstration.
         key: random key of the starts and of the coarse query points.
-        goal: last pose, (7,), T_world_query; by default the demonstration's last pose, moved by the centroids.
+        goal: pose at the release, (7,), T_world_query; by default the demonstration's, moved by the centroids.
         fix_last: end at the goal; otherwise the demonstration is carried rigidly with the pick.
         config: settings.
         progress: see `solve`.
@@ -141,9 +141,10 @@ def carry(
     trajectories = carry_to_picks(reference.trajectory, picks, goal)
     count = len(result.trajectories)
     residual = pick_residual(float(result.loss), pick.descriptors[0]) if result.finite.any() else np.nan
-    return dataclasses.replace(
+    result = dataclasses.replace(
         result,
         trajectories=trajectories[:count],
         initial_trajectories=trajectories[count:],
         residual=np.asarray(residual, result.energies.dtype),
     )
+    return with_ends(result, reference)

@@ -12,6 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 from tdf_jax._internal import checks
 from tdf_jax._internal.deprecation import renamed_fields
 from tdf_jax._internal.errors import InputError
+from tdf_jax.energy.reference import Reference
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.trajectory import Trajectory
 
 
@@ -32,11 +34,11 @@ def _unknown() -> np.ndarray:
         "confidence",
         "recognised",
     ],
-    meta_fields=[],
+    meta_fields=["grasp", "release"],
 )
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
 class Result:
-    """Result of any solver. Every field is an array; unknown values are NaN.
+    """Result of any solver. Every field but the two indices is an array; unknown values are NaN.
 
     `optimize` keeps every start to the end, so its candidates are its starts. `solve` and `carry` follow many starts on
     a few query points, drop most of them, and refine the best distinct candidates on all query points.
@@ -58,6 +60,8 @@ class Result:
             with weights that it is calibrated for.
         recognised: probability that the object is of the demonstration's category, in [0, 1], see
             `tdf_jax.recognition`; a scalar, set by `imitate` with shipped weights.
+        grasp: index of the pose at which the object is grasped; poses before it are the approach.
+        release: index of the pose at which it is released, from the end: -1 unless there is a retreat.
     """
 
     trajectories: Float[Array | np.ndarray, "*batch candidates poses 7"]
@@ -68,6 +72,8 @@ class Result:
     residual: Float[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_unknown)
     confidence: Float[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_unknown)
     recognised: Float[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_unknown)
+    grasp: int = 0
+    release: int = -1
 
     @property
     def finite(self) -> Bool[Array | np.ndarray, "*batch candidates"]:
@@ -96,6 +102,21 @@ class Result:
         """The best trajectory, T_world_query."""
         index = jnp.asarray(self.best)[..., None, None, None]
         return Trajectory(jnp.take_along_axis(jnp.asarray(self.trajectories), index, axis=-3)[..., 0, :, :])
+
+    @property
+    def picks(self) -> Float[Array | np.ndarray, "*batch candidates 7"]:
+        """Pose of the query frame at the grasp of every candidate, T_world_query, `wxyz_xyz`."""
+        return self.trajectories[..., self.grasp, :]
+
+    @property
+    def pick(self) -> Float[Array, "*batch 7"]:
+        """Pose of the query frame at the grasp, of the best trajectory, T_world_query, `wxyz_xyz`."""
+        return self.trajectory.wxyz_xyz[..., self.grasp, :]
+
+    @property
+    def goal(self) -> Float[Array, "*batch 7"]:
+        """Pose of the query frame at the release, of the best trajectory, T_world_query, `wxyz_xyz`."""
+        return self.trajectory.wxyz_xyz[..., self.release, :]
 
     @property
     def loss(self) -> float | Float[Array | np.ndarray, "*batch"]:
@@ -147,7 +168,7 @@ class Result:
         }
         if not np.asarray(self.finite).any():
             return rows
-        pick = np.asarray(self.trajectory.wxyz_xyz[0])
+        pick = np.asarray(self.pick)
         energies = np.sort(np.asarray(self.energies)[np.asarray(self.finite)])
         others = ", ".join(f"{energy:.5f}" for energy in energies[1:4]) + (", ..." if len(energies) > 4 else "")
         rows["pick"] = f"xyz {_numbers(pick[4:])} m, wxyz {_numbers(pick[:4])} (T_world_query)"
@@ -162,6 +183,38 @@ class Result:
         return rows
 
 
+def with_ends(result: Result, reference: Reference) -> Result:
+    """Add the demonstrated approach and retreat to a result of the poses from the grasp to the release.
+
+    The approach moves rigidly with the pick, the retreat with the pose of the release.
+
+    Args:
+        result: result whose trajectories are as long as the reference's.
+        reference: the demonstration.
+
+    Returns:
+        The result with longer trajectories and initial trajectories; the same if there is neither part.
+    """
+    before, after = len(reference.approach), len(reference.retreat)
+    if not before and not after:
+        return result
+    grasp, release = reference.trajectory.wxyz_xyz[0], reference.trajectory.wxyz_xyz[-1]
+    ends = (grasp, release, reference.approach, reference.retreat)
+    longer = {name: _longer(getattr(result, name), *ends) for name in ("trajectories", "initial_trajectories")}
+    return dataclasses.replace(result, **longer, grasp=result.grasp + before, release=result.release - after)
+
+
+@jax.jit
+def _longer(trajectories, grasp, release, approach, retreat):
+    def extend(wxyz_xyz):
+        pick_motion = se3.compose(wxyz_xyz[0], se3.inverse(grasp))
+        goal_motion = se3.compose(wxyz_xyz[-1], se3.inverse(release))
+        parts = [se3.compose(pick_motion, approach), wxyz_xyz, se3.compose(goal_motion, retreat)]
+        return jnp.concatenate(parts).astype(wxyz_xyz.dtype)
+
+    return jax.vmap(extend)(jnp.asarray(trajectories))
+
+
 def _numbers(values) -> str:
     return "(" + ", ".join(f"{value:.3f}" for value in values) + ")"
 
@@ -170,4 +223,4 @@ def _distinct_picks(result: Result) -> int:
     # Display may look at what comes after the solvers: tests/test_layout.py lists this import.
     from tdf_jax.uncertainty.modes import cluster_poses
 
-    return len(cluster_poses(jnp.asarray(result.trajectories)[:, 0], jnp.asarray(result.energies)))
+    return len(cluster_poses(jnp.asarray(result.picks), jnp.asarray(result.energies)))

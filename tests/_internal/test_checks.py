@@ -56,7 +56,12 @@ VALIDATORS = {
     "pose": (partial(checks.pose, "f()", "x"), wxyz_xyz(), (np.zeros(7), wxyz_xyz() + np.inf), (wxyz_xyz(1),)),
     "rotations": (partial(checks.rotations, "f()", "x"), np.eye(3), (np.ones((3, 3)), -np.eye(3)), (np.eye(4),)),
     "orientation": (partial(checks.orientation, "f()", "x"), np.eye(3), (np.ones((3, 3)),), (np.eye(2), np.ones(3))),
-    "quaternion": (partial(checks.orientation, "f()", "x"), np.ones(4), (np.zeros(4), [np.nan] * 4), (np.ones(5),)),
+    "quaternion": (
+        partial(checks.orientation, "f()", "x"),
+        np.full(4, 0.5),
+        (np.ones(4), np.zeros(4), [np.nan] * 4),
+        (np.ones(5),),
+    ),
     "points": (partial(checks.points, "f()", name="x"), CLOUD, (CLOUD * np.nan, CLOUD * 0), (CLOUD[:20], CLOUD[:, 0])),
     "query": (partial(checks.query, "f()"), CLOUD, (CLOUD * np.inf,), (CLOUD[0], CLOUD[:0])),
 }

@@ -124,7 +124,7 @@ BAD_POSES = {
     "has no pose; expected at least one": np.zeros((0, 7), np.float32),
     "pose 1 of path is NaN or infinite": broken(1, 5, np.nan),
     "pose 2 of path is NaN or infinite": broken(2, 0, np.inf),
-    "the quaternion of pose 1 of path has length 0.0e": broken(1, 0, 0),
+    "pose 1 of path has a quaternion of norm 0": broken(1, 0, 0),
     "has dtype int32": np.ones((3, 7), np.int32),
     "is a list; expected an array": [[1, 0, 0, 0, 0, 0, 0]] * 2,
 }
@@ -245,8 +245,8 @@ def test_npz_files_with_something_else_are_refused(tmp_path, arrays, message):
 
 def test_wrong_paths(tmp_path):
     for call in (lambda path: save_trajectory(path, line()), load_trajectory):
-        with pytest.raises(InputError, match="suffix '.csv'; expected .npz or .tum"):
-            call(tmp_path / "path.csv")
+        with pytest.raises(InputError, match="suffix '.txt'; expected .npz or .tum"):
+            call(tmp_path / "path.txt")
     with pytest.raises(InputError, match="there is no file .*path.tum"):
         load_trajectory(tmp_path / "path.tum")
     with pytest.raises(InputError, match="cannot write .*path.npz"):

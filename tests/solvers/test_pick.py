@@ -169,7 +169,7 @@ def test_one_query_point_has_no_residual(small_model, field, demonstration):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"goal": np.zeros(7)}, "quaternion not zero"),
+        ({"goal": np.zeros(7)}, "a quaternion of norm 0"),
         ({"goal": np.ones(6)}, "shape"),
         ({"key": 3}, "key"),
         ({"device_mesh": "all"}, "device_mesh"),

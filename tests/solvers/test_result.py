@@ -52,9 +52,11 @@ def test_no_finite_candidate_is_an_error():
         _ = canned((np.nan, np.inf, np.nan)).trajectory
 
 
-def test_what_is_unknown_is_nan_and_every_field_is_an_array():
+def test_what_is_unknown_is_nan_and_every_other_field_is_an_array():
     result = canned()
     for field in dataclasses.fields(result):
+        if field.name in ("grasp", "release"):
+            continue
         assert isinstance(getattr(result, field.name), jax.Array | np.ndarray)
     assert np.isnan([result.residual, result.confidence, result.recognised]).all()
 

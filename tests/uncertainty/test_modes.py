@@ -320,7 +320,7 @@ def test_waypoints_poses_and_scales_share_one_program(shown, reference, demonstr
     ("settings", "message"),
     [
         ({"pose": np.ones((2, 7))}, r"pose has shape \(2, 7\).*jax.vmap"),
-        ({"pose": np.zeros(7)}, "pose is"),
+        ({"pose": np.zeros(7)}, "pose has a quaternion of norm 0"),
         ({"pose": np.full(7, np.nan)}, "pose is"),
         ({"waypoint": 4}, "waypoint is 4; expected a whole number from -4 to 3"),
         ({"waypoint": 1.0}, "waypoint is 1.0"),
