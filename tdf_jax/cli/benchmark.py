@@ -91,10 +91,10 @@ def benchmark(
     }  # fmt: skip
     picks = count_errors(makers, model, demonstrations, folder, seed=seed)
     extras = sections(scores, picks)
-    _draw(out, makers, scores, extras)
     write_record("tdf benchmark", out / RECORD, record(scores, model, settings, extras), indent=None)
     replace_file("tdf benchmark", out / PAGE, page(scores, model, settings, extras).encode())
     print(out / PAGE)
+    _draw(out, makers, scores, extras)
 
 
 def _makers(pairs, seed, height, clouds, targets, num_poses) -> list[Callable]:
@@ -114,11 +114,10 @@ def _makers(pairs, seed, height, clouds, targets, num_poses) -> list[Callable]:
 
 
 def _draw(out, makers, scores, extras) -> None:
+    from tdf_jax.cli.pictures import Pictures
     from tdf_jax.evaluation.path_methods import LIBRARY
     from tdf_jax.evaluation.path_report import PICTURES
     from tdf_jax.geometry.paths import PATHS
-    from tdf_jax.viz.evaluation import demonstrations_figure, errors_figure, reliability_figure, truth_figure
-    from tdf_jax.viz.style import save_figure
 
     # The first six tasks are one of each path with the goal not displaced. Later tasks with the same path are drawn
     # instead where there are some, because they show the displaced goals.
@@ -127,13 +126,26 @@ def _draw(out, makers, scores, extras) -> None:
         makers[index + index % 4 * kinds if index + index % 4 * kinds < len(makers) else index]
         for index in range(min(kinds, len(makers)))
     ]
-    save_figure(out / PICTURES["truth"], truth_figure([make() for make in shown]))
     first = scores[0].clouds
-    save_figure(out / PICTURES["errors"], errors_figure([one for one in scores if one.clouds == first], LIBRARY))
-    if "reliability" in extras:
-        save_figure(out / PICTURES["reliability"], reliability_figure(scores, extras["reliability"]["bins"]))
-    if "demonstrations" in extras:
-        save_figure(out / PICTURES["demonstrations"], demonstrations_figure(extras["demonstrations"]))
+
+    def figure(name):
+        from tdf_jax.viz import evaluation
+
+        if name == "truth":
+            return evaluation.truth_figure([make() for make in shown])
+        if name == "errors":
+            return evaluation.errors_figure([one for one in scores if one.clouds == first], LIBRARY)
+        if name == "reliability":
+            return evaluation.reliability_figure(scores, extras["reliability"]["bins"])
+        return evaluation.demonstrations_figure(extras["demonstrations"])
+
+    pictures = Pictures("tdf benchmark")
+    for name in ("truth", "errors", *(name for name in ("reliability", "demonstrations") if name in extras)):
+        with pictures.drawing(out / PICTURES[name]) as path:
+            from tdf_jax.viz.style import save_figure
+
+            save_figure(path, figure(name))
+    pictures.check()
 
 
 def _folder(out: Path) -> Path:

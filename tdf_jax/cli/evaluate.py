@@ -161,21 +161,43 @@ def _check_outputs(json: Path | None, card: Path | None, figures: Path | None) -
 def _draw(folder: Path, model: "Model", outcomes: "Outcomes") -> None:
     """Draw the first condition.
 
-    The pictures show up to `MOST_GENERATED` generated objects of a category, and every real object in its first pose.
-
     Args:
         folder: folder of the pictures, made if it is missing; pictures in it are replaced.
         model: the network, whose outcomes are the first of each list.
         outcomes: outcomes of all methods; baselines are not drawn.
 
     Raises:
-        InputError: the folder or a picture cannot be written.
+        PictureError: a picture cannot be drawn or written.
     """
-    from tdf_jax.evaluation.pick_report import is_real
-    from tdf_jax.viz.reconstruction import reconstruction_figure, transfer_figure
-    from tdf_jax.viz.style import save_figure
+    from tdf_jax.cli.pictures import Pictures
 
+    pictures = Pictures("tdf evaluate")
+    reconstructions, transfers = (folder / name for name in PICTURES)
     _, condition = next(iter(outcomes))
+    words = f"weights {model.info.name}, cloud {condition}"
+    panels = []
+    with pictures.drawing(reconstructions, transfers):
+        folder.mkdir(exist_ok=True)
+        panels = _panels(model, outcomes, condition)
+    if panels:
+        with pictures.drawing(reconstructions):
+            from tdf_jax.viz.reconstruction import reconstruction_figure
+            from tdf_jax.viz.style import save_figure
+
+            title = f"Surfaces of occupancy 0.5, refined: {words}"
+            save_figure(reconstructions, reconstruction_figure(panels, title))
+        with pictures.drawing(transfers):
+            from tdf_jax.viz.reconstruction import transfer_figure
+            from tdf_jax.viz.style import save_figure
+
+            save_figure(transfers, transfer_figure(panels, f"The place of a demonstration on other objects: {words}"))
+    pictures.check()
+
+
+def _panels(model: "Model", outcomes: "Outcomes", condition: str) -> "list[Panel]":
+    """Up to `MOST_GENERATED` generated objects of a category, and every real object in its first pose."""
+    from tdf_jax.evaluation.pick_report import is_real
+
     panels = []
     for (objects, clouds), (outcome, *_) in outcomes.items():
         if clouds == condition:
@@ -184,19 +206,7 @@ def _draw(folder: Path, model: "Model", outcomes: "Outcomes") -> None:
             panels += [
                 _panel(model, outcome, index) for index in firsts[: None if is_real(objects) else MOST_GENERATED]
             ]
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"tdf evaluate: cannot make {folder} ({error}); expected a place in an existing folder"
-        ) from None
-    words = f"weights {model.info.name}, cloud {condition}"
-    figures = (
-        reconstruction_figure(panels, f"Surfaces of occupancy 0.5, refined: {words}"),
-        transfer_figure(panels, f"The place of a demonstration on other objects: {words}"),
-    )
-    for name, figure in zip(PICTURES, figures):
-        save_figure(folder / name, figure)
+    return panels
 
 
 def _panel(model: "Model", outcome: "Outcome", index: int) -> "Panel":

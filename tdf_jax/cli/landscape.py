@@ -19,6 +19,7 @@ from tdf_jax._internal.cache import digest
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file, replace_folder
 from tdf_jax.cli.options import LandscapeSettings, make_scene, resolved
+from tdf_jax.cli.pictures import Pictures
 from tdf_jax.energy.reference import Reference, describe
 from tdf_jax.evaluation.scene import Scene
 from tdf_jax.geometry import se3
@@ -33,7 +34,6 @@ from tdf_jax.networks.checkpoint import load_model
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.field import DescriptorField
 from tdf_jax.solvers.initial import default_goal
-from tdf_jax.viz import html
 
 RESULT = "result.json"
 NAMES = (RESULT, "landscape.npz", "map.png", "isosurface.png", "slices.gif", "landscape.html")
@@ -66,6 +66,7 @@ def landscape(settings: Annotated[LandscapeSettings, tyro.conf.arg(name="")] = L
     query = _query(settings, np.asarray(scene.demonstration.query))
     demonstration = dataclasses.replace(scene.demonstration, query=query)
     reference = given if settings.query == "given" else describe(model, demonstration)
+    pictures = Pictures("tdf landscape")
     with replace_folder("tdf landscape", settings.out, RESULT, NAMES) as folder:
         swept = time.perf_counter()
         found = _swept(settings, field, reference, grid, rotations)
@@ -79,13 +80,14 @@ def landscape(settings: Annotated[LandscapeSettings, tyro.conf.arg(name="")] = L
             path = lowest_cost_path(found, *ends, settings.sharpness)
         change = None if settings.query == "given" else query_change(field, given, reference, grid, rotations[0])
         if not settings.no_plots:
-            _draw(settings, folder, scene, found, expected, path)
+            _draw(settings, folder, scene, found, expected, path, pictures)
         seconds["total"] = time.perf_counter() - began
         record = _record(settings, found, reference, change, waypoints, expected, path, seconds)
         save_landscape(folder / "landscape.npz", found, {"settings": record["settings"]})
         replace_file("tdf landscape", folder / RESULT, json.dumps(record, indent=1).encode())
     _unfinished(settings).unlink(missing_ok=True)
     print(json.dumps(record, indent=1) if settings.json else _table(record, settings.out))
+    pictures.check()
 
 
 def _rotations(settings, at_pick):
@@ -131,8 +133,10 @@ def _check_extras(settings) -> None:
     if settings.grid not in PLANES:
         libigl("tdf landscape")
     if not settings.no_page:
-        from tdf_jax.viz.html import pages
-
+        try:
+            from tdf_jax.viz.html import pages
+        except Exception:  # matplotlib is broken, which is no reason not to sweep: all pictures will be missing
+            return
         pages("tdf landscape")
 
 
@@ -203,18 +207,29 @@ def _ends(grid, start, goal):
     return start, goal
 
 
-def _draw(settings, folder: Path, scene: Scene, found: Landscape, expected, path) -> None:
-    from tdf_jax.viz import landscapes
-    from tdf_jax.viz.style import save_figure
+def _draw(settings, folder: Path, scene: Scene, found: Landscape, expected, path, pictures: Pictures) -> None:
+    flat = len(found.grid.shape) == 2
 
-    marks = landscapes.Marks(np.asarray(scene.points), scene.meshes[1], expected, path)
-    if len(found.grid.shape) == 2:
-        save_figure(folder / "map.png", landscapes.map_figure(found, marks))
-    else:
-        save_figure(folder / "isosurface.png", landscapes.isosurface_figure(found, marks))
-        landscapes.save_slices(folder / "slices.gif", found, marks)
+    def marks():
+        from tdf_jax.viz.landscapes import Marks
+
+        return Marks(np.asarray(scene.points), scene.meshes[1], expected, path)
+
+    with pictures.drawing(folder / ("map.png" if flat else "isosurface.png")) as file:
+        from tdf_jax.viz.landscapes import isosurface_figure, map_figure
+        from tdf_jax.viz.style import save_figure
+
+        save_figure(file, (map_figure if flat else isosurface_figure)(found, marks()))
+    if not flat:
+        with pictures.drawing(folder / "slices.gif") as file:
+            from tdf_jax.viz.landscapes import save_slices
+
+            save_slices(file, found, marks())
     if not settings.no_page:
-        html.save_page(folder / "landscape.html", found, marks, "Energy landscape")
+        with pictures.drawing(folder / "landscape.html") as file:
+            from tdf_jax.viz.html import save_page
+
+            save_page(file, found, marks(), "Energy landscape")
 
 
 def _record(settings, found: Landscape, reference, change, waypoints, expected, path, seconds) -> dict:

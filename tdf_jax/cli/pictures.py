@@ -21,22 +21,25 @@ class Pictures:
         self._missing: list[str] = []
 
     @contextlib.contextmanager
-    def drawing(self, path: Path) -> Iterator[Path]:
-        """Note a picture as missing if the block fails, and go on; only an interruption passes.
+    def drawing(self, path: Path, *others: Path) -> Iterator[Path]:
+        """Note pictures as missing if the block fails, and go on; only an interruption passes.
 
         Args:
-            path: the picture that the block writes. Imports that only it needs belong into the block.
+            path: picture that the block is for. Imports that only the picture needs belong into the block.
+            others: further pictures that the block is for.
 
         Yields:
-            The path.
+            The first path.
         """
         try:
             yield path
         except Exception as error:
             lines = str(error).splitlines()
             reason = f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
-            state = f"{path} is of an earlier run" if path.exists() else f"{path.name} is missing"
-            self._missing.append(f"{state} ({reason})")
+            states = (
+                f"{one} is of an earlier run" if one.exists() else f"{one.name} is missing" for one in (path, *others)
+            )
+            self._missing.append(f"{', '.join(states)} ({reason})")
 
     def check(self) -> None:
         """End a command.

@@ -1,7 +1,7 @@
 """`tdf reproduce`: the table and the figures of the paper."""
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar, get_args
 
@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
+from tdf_jax.cli.pictures import Pictures
 from tdf_jax.networks.checkpoint import load_model
 from tdf_jax.paper import energy_maps, figures, table
 from tdf_jax.paper.runs import Run
@@ -64,61 +65,60 @@ def reproduce(
         (out / RUNS).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"tdf reproduce: cannot make the folder {out} ({error}); expected a writable place") from None
-    store = Store(model, out / RUNS)
+    store, pictures = Store(model, out / RUNS), Pictures("tdf reproduce")
     for name in names:
-        for path in _COMMANDS[name](store, setting, fast, out):
-            print(f"saved {path}")
+        _COMMANDS[name](store, setting, fast, out, pictures)
+    pictures.check()
 
 
-def _table1(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
+def _table1(store: Store, base: Setting, fast: bool, out: Path, pictures: Pictures) -> None:
     plan = table.planned(base, 1, table.FAST_VARIATIONS) if fast else table.planned(base)
     settings = [setting for _, chosen in plan for setting in chosen]
     _run_all(store, dict(enumerate(settings)), "table 1")
     rows = table.rows(store.run, plan)
-    yield _text(out / "table1.md", table.as_markdown(rows))
-    yield _text(out / "table1.csv", table.as_csv(rows))
+    for path, content in (
+        (out / "table1.md", table.as_markdown(rows)),
+        (out / "table1.csv", table.as_csv(rows)),
+    ):
+        replace_file("tdf reproduce", path, content.encode())
+        print(f"saved {path}")
 
 
-def _fig1(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
-    from tdf_jax.viz import paper as pictures
-
+def _fig1(store: Store, base: Setting, fast: bool, out: Path, pictures: Pictures) -> None:
     settings = figures.figure1(base)
-    yield _picture(out / "fig1.png", pictures.figure1(_run_all(store, settings, "figure 1"), scene(settings["l_t"])))
+    runs = _run_all(store, settings, "figure 1")
+    _draw(pictures, out / "fig1.png", lambda paper: paper.figure1(runs, scene(settings["l_t"])))
 
 
-def _fig2(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
-    from tdf_jax.viz import paper as pictures
-
+def _fig2(store: Store, base: Setting, fast: bool, out: Path, pictures: Pictures) -> None:
     count = FAST_GRID if fast else GRID
     fields = {
         name: store.landscapes(base, name, count) for name in tqdm(energy_maps.FIELDS, desc="figure 2", unit="field")
     }
-    yield _picture(out / "fig2.png", pictures.figure2({"test mug": fields["test mug"]}))
-    yield _picture(out / "fig2_mugs_and_poses.png", pictures.figure2(fields))
+    _draw(pictures, out / "fig2.png", lambda paper: paper.figure2({"test mug": fields["test mug"]}))
+    _draw(pictures, out / "fig2_mugs_and_poses.png", lambda paper: paper.figure2(fields))
 
 
-def _fig3(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
-    from tdf_jax.viz import paper as pictures
-
+def _fig3(store: Store, base: Setting, fast: bool, out: Path, pictures: Pictures) -> None:
     settings = figures.figure3(base, (0.25, *figures.PAPER_DISTANCES), 1) if fast else figures.figure3(base)
-    yield _picture(out / "fig3.png", pictures.figure3(_run_all(store, settings, "figure 3")))
+    runs = _run_all(store, settings, "figure 3")
+    _draw(pictures, out / "fig3.png", lambda paper: paper.figure3(runs))
 
 
-def _fig4(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
-    from tdf_jax.viz import paper as pictures
-
+def _fig4(store: Store, base: Setting, fast: bool, out: Path, pictures: Pictures) -> None:
     settings = figures.figure4(base)
     runs = _run_all(store, settings, "figure 4")
-    yield _picture(
-        out / "fig4.png", pictures.figure4(runs, {name: scene(setting) for name, setting in settings.items()})
+    _draw(
+        pictures,
+        out / "fig4.png",
+        lambda paper: paper.figure4(runs, {name: scene(setting) for name, setting in settings.items()}),
     )
-    yield _picture(out / "fig4_turn.png", pictures.figure4_turn(runs))
+    _draw(pictures, out / "fig4_turn.png", lambda paper: paper.figure4_turn(runs))
 
 
-def _fig5(store: Store, base: Setting, fast: bool, out: Path) -> Iterable[Path]:
-    from tdf_jax.viz import paper as pictures
-
-    yield _picture(out / "fig5.png", pictures.figure5(_run_all(store, figures.figure5(base), "figure 5")))
+def _fig5(store: Store, base: Setting, fast: bool, out: Path, pictures: Pictures) -> None:
+    runs = _run_all(store, figures.figure5(base), "figure 5")
+    _draw(pictures, out / "fig5.png", lambda paper: paper.figure5(runs))
 
 
 _COMMANDS: dict[str, Callable] = dict(zip(EXPERIMENTS, (_table1, _fig1, _fig2, _fig3, _fig4, _fig5)))
@@ -139,13 +139,17 @@ def _run_all(store: Store, settings: dict[Key, Setting], words: str) -> dict[Key
         return figures.collected(run, settings)
 
 
-def _picture(path: Path, figure) -> Path:
-    from tdf_jax.viz.style import save_figure
+def _draw(pictures: Pictures, path: Path, figure: Callable) -> None:
+    """Draw one picture.
 
-    save_figure(path, figure)
-    return path
+    Args:
+        pictures: the pictures of the command.
+        path: .png file.
+        figure: makes the figure; its argument is the module of the paper's figures.
+    """
+    with pictures.drawing(path):
+        from tdf_jax.viz import paper
+        from tdf_jax.viz.style import save_figure
 
-
-def _text(path: Path, content: str) -> Path:
-    replace_file("tdf reproduce", path, content.encode())
-    return path
+        save_figure(path, figure(paper))
+        print(f"saved {path}")

@@ -26,11 +26,10 @@ def shapes(
 
     from tdf_jax._internal import checks
     from tdf_jax._internal.errors import InputError
+    from tdf_jax.cli.pictures import Pictures
     from tdf_jax.evaluation.annotated_meshes import load_annotated
     from tdf_jax.geometry.symmetry import FOLDS
     from tdf_jax.shapes import FAMILIES
-    from tdf_jax.viz.contact_sheet import contact_sheet
-    from tdf_jax.viz.style import save_figure
 
     checks.count("tdf shapes", "--count", count)
     checks.seed("tdf shapes", seed, "--seed")
@@ -42,5 +41,11 @@ def shapes(
     named = [(FOLDS[one.fold], one.mesh) for one in generated] + [
         (f"{one.name}\n{FOLDS[one.fold]}", one.mesh) for one in real
     ]
-    save_figure(out, contact_sheet(named))
-    print(f"saved {out}")
+    pictures = Pictures("tdf shapes")
+    with pictures.drawing(out):
+        from tdf_jax.viz.contact_sheet import contact_sheet
+        from tdf_jax.viz.style import save_figure
+
+        save_figure(out, contact_sheet(named))
+        print(f"saved {out}")
+    pictures.check()

@@ -9,6 +9,7 @@ import tyro
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
+from tdf_jax.cli.pictures import Pictures
 from tdf_jax.networks.checkpoint import SUFFIX, load_model, save_model
 from tdf_jax.networks.model import Model, ModelInfo
 from tdf_jax.training.batch import DIAGONALS
@@ -49,9 +50,6 @@ def train(
         workers: processes that draw the samples of the next steps.
         config: settings of the run.
     """
-    from tdf_jax.viz.style import save_figure
-    from tdf_jax.viz.training import training_figure
-
     if minutes is not None:
         checks.positive("tdf train", "--minutes", minutes)
     if workers < 0:
@@ -82,7 +80,6 @@ def train(
         steps = steps_within(minutes, config, objects, workers) if before is None else before["steps"]
         config = dataclasses.replace(config, steps=steps)
     params = run(config, objects, validation, out, initial=None if model is None else model.params, workers=workers)
-    save_figure(out / "training.png", training_figure(metrics(out)))
     origin = "" if start_from is None else f" from {start_from}"
     source = f"tdf train, {config.steps} steps{origin}, seed {config.seed}"
     smallest, largest = DIAGONALS
@@ -91,6 +88,13 @@ def train(
     )
     save_model(Model(params, config.network, info), target)
     print(f"saved {target}")
+    pictures = Pictures("tdf train")
+    with pictures.drawing(out / "training.png") as path:
+        from tdf_jax.viz.style import save_figure
+        from tdf_jax.viz.training import training_figure
+
+        save_figure(path, training_figure(metrics(out)))
+    pictures.check()
 
 
 def _target(out: Path, weights: Path | None) -> Path:

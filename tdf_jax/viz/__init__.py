@@ -13,3 +13,29 @@ Modules:
     style: colours, sizes, saving
     training: curves of a training run
 """
+
+import contextlib
+import os
+import sys
+
+
+def _import_matplotlib() -> None:
+    """Import matplotlib, also where MPLBACKEND names a backend that does not exist.
+
+    Jupyter sets it for all processes that it starts, and matplotlib then refuses to be imported if it has no such
+    backend. Pictures here are drawn by Agg, whatever the backend; a backend that exists stays the user's.
+    """
+    if "matplotlib" in sys.modules:
+        return
+    backend = os.environ.pop("MPLBACKEND", None)
+    try:
+        import matplotlib
+    finally:
+        if backend is not None:
+            os.environ["MPLBACKEND"] = backend
+    if backend:
+        with contextlib.suppress(ValueError):
+            matplotlib.rcParams["backend"] = backend  # as matplotlib does
+
+
+_import_matplotlib()

@@ -1,17 +1,17 @@
 """Pictures of energy landscapes: maps of planes, and surfaces of equal energy and animated slices of volumes."""
 
 import dataclasses
+import io
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import matplotlib
 import numpy as np
 from jaxtyping import Float
-from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from PIL import Image
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
@@ -228,18 +228,13 @@ def save_slices(path: str | os.PathLike, landscape: Landscape, marks: Marks) -> 
                 title=f"{names[2]} {heights[index]:+.1f} cm from the middle",
             )
 
-        animation = FuncAnimation(figure, draw, frames=len(heights), init_func=lambda: ())
-        path = Path(path)
-        part = path.with_name(f".{path.stem}.part.gif")  # the writer requires a name that ends in .gif
-        try:
-            animation.save(part, writer=PillowWriter(fps=FRAMES_A_SECOND), dpi=GIF_DPI)
-            replace_file("save_slices", path, part.read_bytes())
-        except OSError as error:
-            raise InputError(
-                f"save_slices(): cannot write {path} ({error}); expected a writable file in an existing folder"
-            ) from None
-        finally:
-            part.unlink(missing_ok=True)
+        frames = []
+        for index in range(len(heights)):
+            draw(index)
+            figure.savefig(frame := io.BytesIO(), format="png", dpi=GIF_DPI)
+            frames.append(Image.open(frame).convert("RGB"))
+    show = {"save_all": True, "append_images": frames[1:], "duration": 1000 // FRAMES_A_SECOND, "loop": 0}
+    replace_file("save_slices", path, lambda file: frames[0].save(file, format="GIF", **show))
 
 
 def check_landscape(function: str, landscape: Landscape, axes: int) -> None:
