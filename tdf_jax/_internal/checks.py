@@ -16,8 +16,10 @@ from numpy.typing import ArrayLike
 from tdf_jax._internal.errors import InputError
 
 SEEDS = 2**32  # jax truncates a larger seed to 32 bits without a warning
-# Metres. Up to 512 m float32 numbers are at most 0.03 mm from any coordinate, and a pose is the sum of a few of them.
-FARTHEST = 500.0
+# Metres. Up to 256 m float32 numbers are at most 0.008 mm from any coordinate. A pick is the sum of a few of them, and
+# its energy is rounded too: with the weights for mugs it moves by up to 0.05 mm, and at twice this distance by 0.1 mm.
+FARTHEST = 250.0
+SMALLEST_IN_MILLIMETRES = 10.0  # extent of a cloud above which its numbers are probably millimetres
 UNIT_NORM = 1e-3  # largest deviation of a quaternion's norm from 1: rounding to three decimals, or to float16
 SENTINEL_SHARE = 0.01  # share of the rows that may have one value, where other values are not as common
 MINIMUM_POINTS = 21  # the encoder's 20 nearest neighbours, the point itself included, and one to choose from
@@ -182,10 +184,12 @@ def near(function: str, name: str, coordinates: np.ndarray, given=None) -> None:
         return
     farthest = np.abs(coordinates).max(initial=0.0)
     if farthest > FARTHEST:
+        wide = len(coordinates) < 2 or np.ptp(coordinates, axis=0).max() > SMALLEST_IN_MILLIMETRES
+        unit = " If they are in millimetres, multiply them by 0.001" if wide else ""
         raise InputError(
             f"{function}: {name} has coordinates of up to {farthest:.6g} m; expected at most {FARTHEST:g} m from the "
             "origin, because float32 does not resolve 0.1 mm there. Subtract one offset from all clouds and poses in "
-            "float64, such as offset = points.mean(axis=0), and add it to the resulting positions"
+            f"float64, such as offset = points.mean(axis=0), and add it to the resulting positions.{unit}"
         )
 
 

@@ -133,15 +133,15 @@ def check_frames(function: str, demonstration: Demonstration) -> None:
         smaller = np.concatenate([grasp[:4], metres * grasp[4:]])
         explanations[f"the cloud is probably in {unit}: multiply it by {metres:g}"] = (metres * points, grasp)
         explanations[f"the positions are probably in {unit}: multiply them by {metres:g}"] = (points, smaller)
-    hint = next(
-        (
-            text
-            for text, (cloud, pose) in explanations.items()
-            if _diagonal(cloud) >= 0.02
-            and _gap(cloud, pose, query) <= FARTHEST_GRASP / 2 * (_diagonal(cloud) + _diagonal(query))
-        ),
-        "check that cloud and poses are in one frame and in metres, and that grasp is the index of the grasp",
-    )
+    hint = "check that cloud and poses are in one frame and in metres, and that grasp is the index of the grasp"
+    gaps = {
+        text: _gap(cloud, pose, query) / (_diagonal(cloud) + _diagonal(query))
+        for text, (cloud, pose) in explanations.items()
+        if _diagonal(cloud) >= 0.02
+    }
+    likely = min(gaps, key=lambda text: gaps[text])
+    if gaps[likely] <= FARTHEST_GRASP / 2:
+        hint = likely
     raise InputError(
         f"{function}: at the grasp, pose {demonstration.grasp}, the query points are {gap:.3g} m from the object, "
         f"whose diagonal is {diagonal:.3g} m; expected them at the object; {hint}"

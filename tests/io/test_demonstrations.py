@@ -1,6 +1,9 @@
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
@@ -71,3 +74,55 @@ def test_other_suffixes_and_folders(tmp_path, demonstration):
     with pytest.raises(InputError, match="cannot write"):
         save_demonstration(tmp_path / "missing" / "demo.npz", demonstration)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("indices", [(0, -1), (1, 2), (-3, -2)])
+def test_grasp_and_release_survive_the_file(tmp_path, demonstration, indices):
+    recording = dataclasses.replace(demonstration, grasp=indices[0], release=indices[1])
+    save_demonstration(tmp_path / "demo.npz", recording)
+    again = load_demonstration(tmp_path / "demo.npz")
+    assert (again.grasp, again.release) == indices
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        ({"grasp": 2.0}, "grasp in .* is 2.0; expected one integer"),
+        ({"release": [1, 2]}, "release in .*expected one integer"),
+        ({"grasp": 9}, "grasp is 9; expected a whole number from -4 to 3"),
+        ({"grasp": 3, "release": 1}, "expected the grasp first"),
+        ({"schema": 3}, "has schema 3; expected 1 to 2"),
+    ],
+)
+def test_bad_indices_and_newer_files_are_refused(tmp_path, demonstration, extra, message):
+    np.savez(tmp_path / "demo.npz", **arrays(demonstration), **extra)
+    with pytest.raises(InputError, match=message):
+        load_demonstration(tmp_path / "demo.npz")
+
+
+POINTS = 0.1 * np.random.default_rng(2).normal(size=(60, 3)) + [0.1, 0.05, 0.1]
+T_GRASP = np.array([0.6, 0.0, 0.8, 0.0, 0.12, 0.07, 0.15])
+FRAMES = {
+    "right": (POINTS, T_GRASP, False),
+    "If they are in millimetres, multiply them by 0.001": (1000 * POINTS, T_GRASP, True),
+    "It is probably in millimetres: multiply it by 0.001": (300 * (POINTS - POINTS.mean(axis=0)), T_GRASP, True),
+    "the positions are probably in millimetres": (POINTS, T_GRASP * [1, 1, 1, 1, 1e3, 1e3, 1e3], True),
+    "the positions are probably in centimetres": (POINTS, T_GRASP * [1, 1, 1, 1, 100, 100, 100], True),
+    "the poses are probably T_query_world": (POINTS + [3, 0, 0], None, True),
+    "check that cloud and poses are in one frame": (POINTS + [3, 4, 5], T_GRASP, True),
+}
+
+
+@pytest.mark.parametrize("message", FRAMES)
+def test_wrong_units_and_frames_are_refused_with_the_likely_one(tmp_path, message):
+    points, grasp, wrong = FRAMES[message]
+    if grasp is None:  # the inverse of a grasp at the cloud
+        turn = Rotation.from_quat(T_GRASP[:4], scalar_first=True).inv()
+        grasp = np.concatenate([turn.as_quat(scalar_first=True), -turn.apply(T_GRASP[4:] + [3, 0, 0])])
+    query = 0.02 * np.random.default_rng(3).normal(size=(8, 3))
+    np.savez(tmp_path / "demo.npz", points=points, wxyz_xyz=grasp[None], query=query)
+    if not wrong:
+        assert load_demonstration(tmp_path / "demo.npz").trajectory.num_poses == 1
+        return
+    with pytest.raises(InputError, match=rf"load_demonstration\(\): .*{message}"):
+        load_demonstration(tmp_path / "demo.npz")
