@@ -1,12 +1,12 @@
 """Data sets of labelled objects in a folder of shards; building one can be resumed and depends only on its recipe."""
 
 import concurrent.futures
+import concurrent.futures.process
 import contextlib
 import dataclasses
 import functools
 import json
 import multiprocessing
-import signal
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -24,6 +24,7 @@ from tdf_jax.geometry.symmetry import FOLDS
 from tdf_jax.geometry.winding import libigl
 from tdf_jax.io.meshes import MESH_SUFFIXES, file_axes
 from tdf_jax.shapes import FAMILIES
+from tdf_jax.training import workers as processes
 from tdf_jax.training.labels import UNIFORM_SHARE, Labelled, canonical_mesh, generated_object, scanned_object
 
 MANIFEST = "dataset.json"
@@ -330,16 +331,19 @@ def _label(task) -> Labelled:
 
 
 @contextlib.contextmanager
-def _mapped(function, tasks, workers):
+def _mapped(function, tasks, count):
     """Results in the order of the tasks; processes are spawned because a forked copy of a threaded one may hang."""
-    if workers < 2 or len(tasks) < 2:
+    if count < 2 or len(tasks) < 2:
         yield map(function, tasks)
         return
     context = multiprocessing.get_context("spawn")
-    # Ctrl-C reaches every process of the terminal. This one handles it; the others would only print tracebacks.
-    ignore = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
-    with concurrent.futures.ProcessPoolExecutor(workers, context, **ignore) as pool:
+    with concurrent.futures.ProcessPoolExecutor(count, context, processes.begin) as pool:
         try:
             yield pool.map(function, tasks)
+        except concurrent.futures.process.BrokenProcessPool:
+            raise InputError(
+                "tdf dataset: a process that labelled objects died, perhaps for lack of memory; expected it to live. "
+                "Use fewer --workers, and run again to resume"
+            ) from None
         finally:
             pool.shutdown(cancel_futures=True)  # otherwise an interruption waits for all submitted tasks

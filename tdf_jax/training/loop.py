@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 import time
 from pathlib import Path
 
@@ -25,7 +24,7 @@ from tdf_jax.training.config import TrainConfig
 from tdf_jax.training.dataset import DataSet
 from tdf_jax.training.objective import FRONT, UP, mean_gradient, pair_loss
 from tdf_jax.training.prefetch import num_prefetched, prefetched
-from tdf_jax.training.run_folder import METRICS, claim, drop_later_metrics, restore, save
+from tdf_jax.training.run_folder import add_metrics, claim, drop_later_metrics, restore, save
 
 CORRUPTION_RISE = (0.1, 0.6)  # shares of the run between which the corruption grows
 VALIDATION_BOX, VALIDATION_POSES = 128, 33
@@ -93,7 +92,7 @@ def train(
 
     saved = began = time.monotonic()
     batch = functools.partial(batch_of, config, gradual=initial is None)
-    with prefetched(batch, data, start, workers) as batches, (directory / METRICS).open("a") as metrics:
+    with prefetched(batch, data, start, workers) as batches:
         bar = tqdm(range(start, config.steps), initial=start, total=config.steps, desc="training", disable=not progress)
         for step in bar:
             params, state, parts = _step(
@@ -105,8 +104,7 @@ def train(
             if done or (step + 1) % config.validate_every == 0:
                 row |= {name: validate(state["average"], config, pairs) for name, pairs in measured.items()}
                 row["transfer"] = transfer_errors(state["average"], config, transfers)
-            metrics.write(json.dumps(row) + "\n")
-            metrics.flush()
+            add_metrics(directory, row)
             if not np.isfinite(row["loss"]):
                 raise FloatingPointError(
                     f"train(): the loss is {row['loss']} at step {step + 1}; lower the learning rate"

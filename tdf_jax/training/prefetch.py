@@ -8,10 +8,7 @@ import functools
 import itertools
 import multiprocessing
 import os
-import shutil
-import signal
 import tempfile
-import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,6 +18,7 @@ import numpy as np
 from tdf_jax._internal import checks
 from tdf_jax._internal.devices import one_at_a_time
 from tdf_jax._internal.errors import InputError
+from tdf_jax.training import workers as processes
 from tdf_jax.training.batch import Batch
 from tdf_jax.training.dataset import DataSet
 
@@ -52,8 +50,14 @@ def prefetched(
         else:
             # All processes map the same files and share one copy of the objects.
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tdf_train_")))
-            for field in dataclasses.fields(data):
-                np.save(folder / f"{field.name}.npy", getattr(data, field.name))
+            try:
+                for field in dataclasses.fields(data):
+                    np.save(folder / f"{field.name}.npy", getattr(data, field.name))
+            except OSError as error:
+                raise InputError(
+                    f"train(): cannot write {folder} ({error.strerror or error}); expected room for the objects there. "
+                    "Set TMPDIR to another folder, or use one worker"
+                ) from None
             # Processes are spawned because a forked copy of a process that runs JAX may hang.
             pool = concurrent.futures.ProcessPoolExecutor(
                 workers, multiprocessing.get_context("spawn"), _open, (folder, draw)
@@ -85,22 +89,12 @@ def _in_order(ask, start, count):
 def _open(folder, draw):
     """Prepare this process to draw batches."""
     global _draw
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process of the terminal, and the run handles it
-    threading.Thread(target=_end_with_the_run, args=(folder,), daemon=True).start()
+    processes.begin(folder)
     columns = {
         field.name: np.asarray(np.load(folder / f"{field.name}.npy", mmap_mode="r"))
         for field in dataclasses.fields(DataSet)
     }
     _draw = functools.partial(draw, DataSet(**columns))
-
-
-def _end_with_the_run(folder):
-    """End this process and remove the folder when the run ends, because a killed run can do neither."""
-    run = multiprocessing.parent_process()
-    assert run is not None
-    run.join()
-    shutil.rmtree(folder, ignore_errors=True)
-    os._exit(1)
 
 
 def _drawn(step):

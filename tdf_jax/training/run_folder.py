@@ -82,6 +82,28 @@ def metrics(directory: Path) -> list[dict]:
     return [row for row in rows if row is not None]
 
 
+def add_metrics(directory: Path, row: dict) -> None:
+    """Add a row to a run's metrics.
+
+    Args:
+        directory: folder of the run.
+        row: metrics of a step, as JSON has them.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    path = directory / METRICS
+    try:
+        # Closed at once: what a full disk has no room for must not wait in a buffer.
+        with path.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+    except OSError as error:
+        raise InputError(
+            f"train(): cannot write {path} ({error.strerror or error}); expected a writable file. Free some room if "
+            "the disk is full, and run again to resume"
+        ) from None
+
+
 def drop_later_metrics(directory: Path, step: int) -> None:
     """Remove the metrics of steps after a checkpoint, which a resumed run repeats."""
     rows = [row for row in metrics(directory) if row["step"] <= step]

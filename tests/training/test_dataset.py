@@ -2,7 +2,11 @@
 
 import dataclasses
 import json
+import os
+import subprocess
 import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -275,6 +279,46 @@ def test_processes_give_the_same(tmp_path):
     quiet_build(recipe, tmp_path / "two", workers=2)
     for a, b in zip(load(tmp_path / "one"), load(tmp_path / "two")):
         same(a, b)
+
+
+def dying(task):
+    os._exit(1)
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_is_told():
+    with (
+        pytest.raises(InputError, match="a process that labelled objects died.* Use fewer --workers"),
+        dataset._mapped(dying, [1, 2, 3], 2) as rows,
+    ):
+        list(rows)
+
+
+RUN = """
+import sys, time
+sys.path.append(sys.argv[1])
+from test_dataset import waiting
+from tdf_jax.training.dataset import _mapped
+
+if __name__ == "__main__":
+    with _mapped(waiting, [1, 2, 3], 2) as rows:
+        list(rows)
+"""
+
+
+def waiting(task):
+    print(task, flush=True)
+    time.sleep(600)
+
+
+@pytest.mark.slow
+def test_a_killed_build_leaves_no_processes(tmp_path):
+    script = tmp_path / "run.py"
+    script.write_text(RUN)
+    with subprocess.Popen([sys.executable, script, Path(__file__).parent], stdout=subprocess.PIPE, text=True) as run:
+        assert run.stdout.readline()
+        run.kill()
+        run.stdout.read()  # ends when the last process that could write there has ended
 
 
 def test_a_data_set_of_another_family_has_its_objects_and_their_symmetries(tmp_path):

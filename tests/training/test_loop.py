@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -232,6 +233,17 @@ def test_metrics_cut_short_anywhere_are_dropped(tmp_path):
         (tmp_path / "metrics.jsonl").write_text(whole + "\n" + row[:cut])
         run_folder.drop_later_metrics(tmp_path, 2)
         assert (tmp_path / "metrics.jsonl").read_text() == whole + "\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+def test_metrics_on_a_full_disk_are_refused_by_name(tmp_path):
+    run_folder.add_metrics(tmp_path, {"step": 1})
+    assert run_folder.metrics(tmp_path) == [{"step": 1}]
+    (tmp_path / "metrics.jsonl").unlink()
+    (tmp_path / "metrics.jsonl").symlink_to("/dev/full")
+    message = r"^train\(\): cannot write .*metrics.jsonl \(No space left on device\).* run again to resume$"
+    with pytest.raises(InputError, match=message):
+        run_folder.add_metrics(tmp_path, {"step": 2})
 
 
 @pytest.mark.slow
