@@ -20,7 +20,18 @@ from tdf_jax.paper.setting import DEPRECATED_FIELD_ENERGIES
 
 MEMORY = "error: out of memory; lower the number of starts, poses, query points or points, or raise the pitch"
 # each is a function in the module of its name
-COMMANDS = ("imitate", "landscape", "convert", "evaluate", "benchmark", "shapes", "dataset", "train", "reproduce")
+COMMANDS = (
+    "imitate",
+    "demonstrate",
+    "landscape",
+    "convert",
+    "evaluate",
+    "benchmark",
+    "shapes",
+    "dataset",
+    "train",
+    "reproduce",
+)
 # Options of the release before by command; they are accepted for one release, with a warning.
 DEPRECATED_FLAGS = {
     "imitate": {"--inits": "--num-starts", "--poses": "--num-poses"},

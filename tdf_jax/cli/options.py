@@ -34,8 +34,9 @@ class SceneSettings:
     Attributes:
         target: mesh or point cloud of the new object.
         scale: metres per unit of the target file, such as 0.01 for centimetres.
+        drop_invalid: remove points of the target file that are NaN or stand for missing measurements.
         target_pose: pose of the target in the world: that of its file, or a random rotation and translation of it.
-        demonstration: .npz file with points (N, 3), wxyz_xyz (n, 7) and query (Q, 3), in metres.
+        demonstration: .npz file that `tdf demonstrate` wrote, or with the arrays points, wxyz_xyz and query, in metres.
         category: category of generated objects.
         trajectory: shape of a generated demonstration, from a mug's handle, a bowl's rim or a bottle's neck to a place
             0.30 m away; lift_over ends on a shelf there.
@@ -48,6 +49,7 @@ class SceneSettings:
 
     target: Annotated[Path | None, _option("FILE", "a generated object")] = None
     scale: float = 1.0
+    drop_invalid: bool = False
     target_pose: Annotated[
         Literal["given", "random"] | None, _option(default="given for a file, random for a generated object")
     ] = None
@@ -189,8 +191,9 @@ def resolved(settings: AnySettings) -> AnySettings:
 
 def _check_numbers(settings: SceneSettings) -> None:
     checks.seed(settings.COMMAND, settings.seed, "--seed")
-    if settings.target is None and settings.scale != 1:
-        raise InputError(f"{settings.COMMAND}: --scale is for a --target file; give one, or drop --scale")
+    for name, given in (("scale", settings.scale != 1), ("drop-invalid", settings.drop_invalid)):
+        if settings.target is None and given:
+            raise InputError(f"{settings.COMMAND}: --{name} is for a --target file; give one, or drop --{name}")
     if isinstance(settings, Settings):
         if settings.k is not None and settings.method == "carry":
             raise InputError(
@@ -269,7 +272,9 @@ def _read_target(settings: SceneSettings):
     """Points and, if the file has faces, the mesh."""
     if settings.target is None:
         return None
-    points = load_points(settings.target, settings.points, settings.scale, settings.seed)
+    points = load_points(
+        settings.target, settings.points, settings.scale, settings.seed, drop_invalid=settings.drop_invalid
+    )
     try:
         return points, load_mesh(settings.target, settings.scale)
     except InputError:  # the file has no faces; it has just been read as a cloud
@@ -282,4 +287,4 @@ def _generated(settings: SceneSettings, pair: Case, key: PRNGKeyArray) -> Demons
 
 
 def _moved(points, T):
-    return (points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+    return (points @ T[:3, :3].T + T[:3, 3]).astype(points.dtype)  # float64 where float32 would round far points

@@ -729,6 +729,7 @@ def test_every_start_non_finite_is_told(refusal, weights, monkeypatch):
 def test_commands_are_the_functions_of_their_modules():
     assert set(command_line.COMMANDS) == {
         "imitate",
+        "demonstrate",
         "landscape",
         "convert",
         "evaluate",
