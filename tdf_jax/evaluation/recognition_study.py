@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from tdf_jax._internal.errors import CategoryWarning
+from tdf_jax._internal.errors import TdfWarning
 from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, generated_case, place_demonstration
 from tdf_jax.evaluation.records import header, write_record
 from tdf_jax.geometry.query import box_query
@@ -47,7 +47,7 @@ def evidence(model: Model, category: str, seed: int, index: int, right: bool) ->
     target = case if right else generated_case(others[index // len(CLOUDS) % len(others)], seed, index, clouds=clouds)
     demonstration = place_demonstration(case, "line", 2, box_query(jax.random.key(seed), QUERIES, QUERY_SIZE))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CategoryWarning)
+        warnings.simplefilter("ignore", TdfWarning)
         points = jax.device_put(target.points_b)
         result = imitate(model, demonstration, points, key=jax.random.key(index), fix_last=False)
     return float(result.residual), surface_logit(encode(model, points), points)
