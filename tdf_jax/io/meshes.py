@@ -4,36 +4,47 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
+from tdf_jax.io.content import existing_file, file_bytes, reading
+from tdf_jax.io.gltf import read_gltf
+from tdf_jax.io.obj import read_obj
+from tdf_jax.io.off import read_off
+from tdf_jax.io.ply import read_ply
+from tdf_jax.io.stl import read_stl
 
 if TYPE_CHECKING:
     import trimesh
 
-MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb", ".off")
+MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb", ".gltf", ".off")
 AXES = {sign + name: {"+": 1.0, "-": -1.0}[sign] * np.eye(3)[i] for i, name in enumerate("xyz") for sign in "+-"}
+_READERS = {".obj": read_obj, ".stl": read_stl, ".ply": read_ply, ".off": read_off}
 
 
 def load_mesh(path: str | Path, scale: float = 1.0) -> "trimesh.Trimesh":
-    """Read a mesh; the parts of a scene are joined into one, and coincident vertices are merged.
+    """Read a mesh; its parts are joined into one, and coincident vertices are merged.
+
+    Polygons are cut into triangles, concave ones as well. The parts of a glTF scene are placed as the scene places
+    them, in the pose that the file stores, not that of an animation. Colours, textures, normals, lines and points are
+    left out. A file with a feature that changes the geometry and that is not read, such as a compressed mesh or a
+    skeleton, is refused.
 
     Args:
-        path: .obj, .stl, .ply, .glb or .off file.
+        path: .obj, .stl, .ply, .glb, .gltf or .off file.
         scale: metres per unit of the file, such as 0.01 for centimetres.
 
     Returns:
-        The mesh, metres, in the frame of the file.
+        The mesh, metres, in the frame of the file. Its vertices are float64, so that they may be far from the origin.
 
     Raises:
         InputError: the file is missing, unreadable, of another format, without faces, or not finite.
     """
     path = existing_file("load_mesh()", path, MESH_SUFFIXES, scale)
-    mesh = mesh_in("load_mesh()", path, read_scene("load_mesh()", path), scale)
-    if mesh is None:
+    vertices, faces = read_surface("load_mesh()", path)
+    if not len(faces):
         raise InputError(f"load_mesh(): {path} has no faces; expected a surface; read a point cloud by load_points()")
-    return mesh
+    return joined_mesh("load_mesh()", path, vertices, faces, scale)
 
 
 def file_axes(up: str, front: str) -> Float[np.ndarray, "3 3"]:
@@ -60,86 +71,54 @@ def file_axes(up: str, front: str) -> Float[np.ndarray, "3 3"]:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def existing_file(function: str, path: str | Path, suffixes: tuple[str, ...], scale: float) -> Path:
-    """Check that a file exists and has a known suffix, and that its scale is positive.
+def read_surface(function: str, path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
+    """Read the vertices and triangles of all parts of a file.
 
     Args:
         function: name that error messages begin with.
-        path: file to read.
-        suffixes: known suffixes, in lower case.
-        scale: metres per unit of the file.
+        path: file with one of `MESH_SUFFIXES`.
 
     Returns:
-        The path.
-
-    Raises:
-        InputError: the suffix is unknown, the file is missing, or scale is not above 0.
-    """
-    path = Path(path)
-    if path.suffix.lower() not in suffixes:
-        raise InputError(f"{function}: {path} has suffix {path.suffix!r}; expected one of {', '.join(suffixes)}")
-    if not path.is_file():
-        raise InputError(f"{function}: there is no file {path}; expected an existing file; check the path")
-    checks.positive(function, "scale", scale, "metres per unit of the file")
-    return path
-
-
-def unreadable(function: str, path: Path, error: Exception) -> InputError:
-    """Make the error of a damaged file.
-
-    Args:
-        function: name that the message begins with.
-        path: damaged file.
-        error: exception of the reader.
-
-    Returns:
-        The error to raise.
-    """
-    reason = str(error) or type(error).__name__
-    return InputError(f"{function}: {path} cannot be read as {path.suffix.lower()} ({reason}); save it again")
-
-
-def read_scene(function: str, path: Path) -> "trimesh.Scene":
-    """Read all meshes and clouds of a file.
-
-    Args:
-        function: name that error messages begin with.
-        path: file to read.
-
-    Returns:
-        The scene, in the unit of the file.
+        vertices, (vertices, 3), float64, in the unit and frame of the file. They need not be finite.
+        faces, (faces, 3); none for a cloud.
 
     Raises:
         InputError: the file cannot be read.
     """
-    import trimesh
-
-    try:
-        # Processing would silently drop vertices that are not finite.
-        return trimesh.load_scene(str(path), process=False)
-    except Exception as error:  # parsers of damaged files raise many types, from struct.error to IndexError
-        raise unreadable(function, path, error) from error
+    with reading(function, path):
+        data, suffix = file_bytes(path), path.suffix.lower()
+        return read_gltf(data, path.parent) if suffix in {".glb", ".gltf"} else _READERS[suffix](data)
 
 
-def mesh_in(function: str, path: Path, scene: "trimesh.Scene", scale: float) -> "trimesh.Trimesh | None":
-    """Join the meshes of a scene.
+def joined_mesh(
+    function: str,
+    path: Path,
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    scale: float,
+) -> "trimesh.Trimesh":
+    """Make a mesh of the vertices that its faces use, coincident ones merged.
 
     Args:
         function: name that error messages begin with.
-        path: file of the scene, for error messages.
-        scene: scene of `read_scene`.
+        path: file of the mesh, for error messages.
+        vertices: vertices, (vertices, 3), in the unit of the file.
+        faces: triangles, (faces, 3), at least one.
         scale: metres per unit of the file.
 
     Returns:
-        The mesh, metres, with coincident vertices merged; None if the scene has no faces.
+        The mesh, metres.
 
     Raises:
-        InputError: a vertex is not finite.
+        InputError: a vertex of a face is not finite.
     """
-    if not any(len(getattr(part, "faces", ())) for part in scene.geometry.values()):
-        return None
-    mesh = scene.to_mesh()
-    if not np.isfinite(mesh.vertices).all():
+    import trimesh
+
+    used = np.zeros(len(vertices), dtype=bool)
+    used[faces] = True
+    vertices, faces = vertices[used], (np.cumsum(used) - 1)[faces]
+    if not np.isfinite(vertices).all():
         raise InputError(f"{function}: {path} has vertices that are NaN or infinite; expected finite coordinates")
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    mesh.merge_vertices()
     return mesh.apply_scale(scale)

@@ -1,0 +1,280 @@
+"""Columns of numbers, in text and in arrays: which of them are x, y and z."""
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from tdf_jax.io.content import UnsupportedError
+from tdf_jax.io.text import decode, numbers
+
+_COMMENTS = ("#", "//", "%", "!")
+_MOST = 12  # columns, as in x y z, a normal, a colour with alpha, and two more; a depth image has hundreds
+# x, "X", x [mm], x_mm, Points:0 and the like. What stands behind the axis is a unit.
+_NAME = re.compile(
+    r"(?:points?[_:. ]*|pos(?:ition)?[_:. ]*|coord[_:. ]*)?([xyz012])[\s_]*(?:[\[(/]?\s*([a-z]+)\s*[\])]?)?"
+)
+_UNITS = {"mm": 1e-3, "cm": 1e-2, "dm": 1e-1, "m": 1.0, "km": 1e3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
+_UNITS |= {"metre": 1.0, "metres": 1.0, "meter": 1.0, "meters": 1.0, "inch": 0.0254, "inches": 0.0254}
+_UNITS |= {"millimetres": 1e-3, "millimeters": 1e-3, "centimetres": 1e-2, "centimeters": 1e-2}
+_MIXED = "has numbers with commas as well as points; expected decimal points only; remove the commas"
+_HEADER_FIX = "write the names of the columns into the first line, such as x y z"
+
+
+def read_columns(data: bytes, scale: float = 1.0) -> Float[np.ndarray, "points 3"]:
+    """Read the points of a text file with one point in each line.
+
+    The numbers are separated by blanks, tabs, commas or semicolons; their decimal sign is a point, or a comma where
+    that is clear. Lines that begin with # or // are comments. A first line may name the columns, or give the number of
+    points. Without names the columns are taken as `coordinate_columns` does.
+
+    Args:
+        data: content of the file.
+        scale: metres per unit of the file, to be compared with a unit that the header names.
+
+    Returns:
+        Point cloud, (points, 3), in the unit and frame of the file. An empty field is NaN.
+
+    Raises:
+        ValueError: the file is damaged.
+        UnsupportedError: it is not clear which columns are x, y and z, or how the numbers are written.
+    """
+    rows, names = _lines(decode(data))
+    rows = _without_count(rows)
+    if not rows:
+        raise ValueError("it has no numbers")
+    delimiter, comma = _dialect([row for _, row in rows[1:21] or rows])
+    header = _header(rows, delimiter, comma)
+    if header is not None:
+        rows, names = rows[1:], header
+        if not rows:
+            raise ValueError("it has a line of names, and no numbers")
+    table = [_split(row, delimiter, comma) for _, row in rows]
+    if all(row[-1] == "" for row in table) and len(table[0]) > 1:
+        table = [row[:-1] for row in table]  # a delimiter at the end of each line
+    width = len(table[0])
+    for (number, _), row in zip(rows, table):
+        if len(row) != width:
+            raise ValueError(f"line {number} has {len(row)} columns, and line {rows[0][0]} has {width}")
+    if comma and any(re.fullmatch(r"[+-]?\d*\.\d+", cell) for row in table for cell in row):
+        raise UnsupportedError(_MIXED)
+    _refuse_molecule(table, rows)
+    if header is None and delimiter == "," and width >= 6 and width % 2 == 0:
+        if all(re.fullmatch(r"[+-]?\d+", cell) for row in table for cell in row):
+            raise UnsupportedError(
+                f"has {width} columns of whole numbers between commas, which may be decimal commas; expected decimal "
+                f"points; if they are whole numbers, {_HEADER_FIX.replace('x y z', 'x,y,z,r,g,b')}"
+            )
+    columns = _named(names, table, scale, required=header is not None)
+    if columns is not None:
+        return _values(table, columns, rows)
+    if width < 3:
+        raise UnsupportedError(f"has {width} columns; expected x, y and z in each line")
+    values = np.full((len(table), width), np.nan)
+    for column in range(width if width <= _MOST else 0):
+        try:
+            values[:, column] = _values(table, [column], rows)[:, 0]
+        except ValueError:  # behind the coordinates there may be words
+            if column < 3:
+                raise
+    return coordinate_columns(values)
+
+
+def coordinate_columns(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows 3"]:
+    """Take the coordinates from columns without names: the first three, or those behind a column that counts the rows.
+
+    Args:
+        values: numbers, (rows, columns). Colours, normals and the like behind the coordinates are left out.
+
+    Returns:
+        The coordinates, (rows, 3).
+
+    Raises:
+        UnsupportedError: there are less than three columns or more than 12, the first may be a number of the point or
+            a label, or the rows are poses.
+    """
+    rows, width = values.shape
+    if width < 3:
+        raise UnsupportedError(f"has {width} columns; expected x, y and z in each row")
+    if width > _MOST:
+        raise UnsupportedError(f"has {width} columns; expected at most {_MOST}, x y z first; keep the first three")
+    whole = [np.isfinite(column).all() and (column == np.rint(column)).all() for column in values.T[:4]]
+    counts = rows > 1 and whole[0] and values[0, 0] in {0, 1} and (np.diff(values[:, 0]) == 1).all()
+    if width == 3:
+        if counts:
+            raise UnsupportedError("has a first column that counts the rows, and two more; expected x, y and z")
+        return values
+    if counts:
+        return values[:, 1:4]
+    if whole[0] and not any(whole[1:]):
+        raise UnsupportedError(
+            "has a first column of whole numbers, which may be numbers of the points or labels, before columns that "
+            f"are not; expected x y z first; remove that column, or {_HEADER_FIX}"
+        )
+    if _are_poses(values):
+        raise UnsupportedError("has rows that are poses, with unit quaternions; expected points x y z")
+    return values[:, :3]
+
+
+def named_columns(names: Sequence[str]) -> tuple[list[int], str | None] | None:
+    """Find the columns that are named x, y and z.
+
+    Args:
+        names: names of the columns, such as x, "X", x [mm], x_mm or Points:0.
+
+    Returns:
+        indices of x, y and z, and their unit if the names tell it; None if one of them is missing or not unique.
+    """
+    found, units = {}, set()
+    for column, name in enumerate(names):
+        match = _NAME.fullmatch(name.strip().strip("\"'").strip().lower())
+        if not match or (match[2] and match[2] not in _UNITS) or (match[1].isdigit() and len(name.strip("\"' ")) < 3):
+            continue
+        axis = "xyz"[int(match[1])] if match[1].isdigit() else match[1]
+        if axis in found:
+            return None
+        found[axis] = column
+        units.add(match[2])
+    if len(found) < 3 or len(units) > 1:
+        return None
+    return [found[axis] for axis in "xyz"], units.pop()
+
+
+def _lines(text):
+    """Numbered lines with data, and the names of the columns if a comment above them gives some."""
+    rows, names = [], None
+    for number, line in enumerate(text.split("\n"), 1):
+        line = line.strip()
+        if line.startswith(_COMMENTS):
+            words = re.split(r"[,;\s]+", line.lstrip("#/%! \t"))
+            if not rows and named_columns(words):
+                names = words
+            continue
+        line = line.partition("#")[0].strip()
+        if line and not (not rows and line.lower().startswith("sep=")):  # that line is for spreadsheets
+            rows.append((number, line))
+    return rows, names
+
+
+def _without_count(rows):
+    """Lines without a first one that gives their number, and a title behind that."""
+    if len(rows) < 2 or not re.fullmatch(r"\d+(\s+\d+)?", rows[0][1]):
+        return rows
+    count, *width = (int(word) for word in rows[0][1].split())
+    title = not _is_number(re.split(r"[,;\s]+", rows[1][1])[0])
+    if width:  # rows and columns
+        return rows[1:] if count == len(rows) - 1 and width[0] == len(re.split(r"[,;\s]+", rows[1][1])) else rows
+    if re.fullmatch(r"\d+", rows[1][1]):
+        raise UnsupportedError("has single whole numbers in its first lines, as PTX has; expected x y z in each line")
+    if title and len(rows) - 2 == count:
+        return rows[2:]
+    if len(rows) - 1 != count:
+        if title:
+            _refuse_molecule([row.split() for _, row in rows[2:]], rows[2:])
+        raise ValueError(f"its first line promises {count} points, and {len(rows) - 1 - title} follow")
+    return rows[1:]
+
+
+def _dialect(rows):
+    """The delimiter, None for white space, and whether commas are decimal."""
+    text = "\n".join(rows)
+    if ";" in text:
+        return ";", "," in text
+    if "\t" in text and all("\t" in row and not any(" " in cell.strip() for cell in row.split("\t")) for row in rows):
+        return "\t", "," in text
+    if "," not in text:
+        return None, False
+    words = [row.split() for row in rows]
+    decimal = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?,?")
+    inner = any("," in word[:-1] for row in words for word in row)
+    if inner and all(len(row) >= 3 for row in words):
+        if all(decimal.fullmatch(word) for row in words for word in row):
+            return None, True
+        if all(re.fullmatch(r"[-+\d.,eE]+", word) for row in words for word in row):
+            raise UnsupportedError(_MIXED)
+    return ",", False
+
+
+def _split(row, delimiter, comma):
+    if delimiter is None:
+        cells = [cell.rstrip(",") for cell in row.split()] if comma else row.split()
+    else:
+        cells = [cell.strip() for cell in row.split(delimiter)]
+    return [cell.strip("\"'") for cell in cells] if '"' in row or "'" in row else cells
+
+
+def _is_number(cell):
+    try:
+        numbers([cell])
+    except ValueError:
+        return False
+    return True
+
+
+def _header(rows, delimiter, comma):
+    """Names in the first line, None if it has numbers only."""
+    cells = _split(rows[0][1], delimiter, comma)
+    if all(_is_number(cell) for cell in cells if cell):
+        return None
+    for names in (cells, re.split(r"[,;\t]\s*|\s+", rows[0][1])):
+        if named_columns(names):
+            return names
+    if sum(map(_is_number, cells)) >= 3:
+        return None  # a point with a word behind it
+    raise UnsupportedError(
+        f"has the first line {rows[0][1][:80]!r}; expected numbers, or names of columns among which are x, y and z"
+    )
+
+
+def _named(names, table, scale, required):
+    """Indices of the columns that are named x, y and z, None if there are no names."""
+    found, width = names and named_columns(names), len(table[0])
+    if not found:
+        return None
+    columns, unit = found
+    if len(names) == width - 1 and required:  # the column of row names has none, as in R
+        columns = [column + 1 for column in columns]
+    elif len(names) != width:
+        if required:
+            raise UnsupportedError(
+                f"names {len(names)} columns in its first line, and has {width}; expected one name each"
+            )
+        return None
+    if unit and _UNITS[unit] != 1 and scale == 1:
+        raise UnsupportedError(f"has coordinates in {unit}, as its names say; pass scale={_UNITS[unit]:g}")
+    return columns
+
+
+def _values(table, columns, rows):
+    """Numbers of some columns, (rows, columns); NaN where a field is empty."""
+    cells = [row[column] or "nan" for row in table for column in columns]
+    try:
+        return numbers(cells).reshape(-1, len(columns))
+    except UnsupportedError:
+        raise
+    except ValueError as error:
+        wrong = next(i for i, cell in enumerate(cells) if not _is_number(cell))
+        raise ValueError(f"line {rows[wrong // len(columns)][0]}: {error}") from None
+
+
+def _refuse_molecule(table, rows):
+    if table and all(re.fullmatch(r"[A-Z][a-z]?\d*", row[0]) and len(row) > 3 for row in table):
+        raise UnsupportedError(
+            f"has the word {table[0][0]} in line {rows[0][0]}, as files of molecules have, which are also named .xyz; "
+            "expected x y z in each line"
+        )
+
+
+def _are_poses(values):
+    values = values[np.isfinite(values).all(axis=1)]
+
+    def unit(columns):
+        return len(values) > 0 and bool((np.abs(np.linalg.norm(values[:, columns], axis=1) - 1) < 1e-3).all())
+
+    match values.shape[1]:
+        case 7:  # wxyz_xyz, or the quaternion last; normals and a curvature may also be of norm 1
+            return unit(slice(0, 4)) or (unit(slice(3, 7)) and not unit(slice(3, 6)))
+        case 8:  # the TUM format, with the time first
+            return unit(slice(4, 8)) and bool((np.diff(values[:, 0]) > 0).all())
+    return False

@@ -1,0 +1,121 @@
+"""Contents of files: bytes, what they hold in spite of the suffix, and the errors of what cannot be read."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from tdf_jax._internal import checks
+from tdf_jax._internal.errors import InputError
+
+# What the content of a file begins with, and the suffix that belongs to it.
+_MAGIC = {
+    b"ply\n": ".ply",
+    b"ply\r": ".ply",
+    b"glTF": ".glb",
+    b"\x93NUMPY": ".npy",
+    b"# .PCD": ".pcd",
+    b"#.PCD": ".pcd",
+}
+# What is not a mesh or a cloud at all, with what to do about it.
+_FOREIGN = {
+    b"version https://git-lfs": ("is a pointer of Git LFS, not the file itself", "run git lfs pull"),
+    b"\x1f\x8b": ("is compressed by gzip", "unpack it by gunzip"),
+    b"BZh": ("is compressed by bzip2", "unpack it by bunzip2"),
+    b"\xfd7zXZ": ("is compressed by xz", "unpack it by unxz"),
+    b"\x28\xb5\x2f\xfd": ("is compressed by zstd", "unpack it by unzstd"),
+    b"PK\x03\x04": ("is a zip archive", "unpack it"),
+    b"7z\xbc\xaf": ("is a 7z archive", "unpack it"),
+    b"Rar!": ("is a RAR archive", "unpack it"),
+    b"\x89HDF": ("is an HDF5 file", "read the array by h5py and save it by np.save"),
+    b"\x89PNG": ("is a picture", "give the cloud or the mesh"),
+    b"\xff\xd8\xff": ("is a picture", "give the cloud or the mesh"),
+    b"LASF": ("is a LAS cloud", "convert it to .ply"),
+    b"%PDF": ("is a PDF document", "give the cloud or the mesh"),
+    b"<!doctype html": ("is a web page", "download the file itself"),
+    b"<html": ("is a web page", "download the file itself"),
+}
+
+
+class UnsupportedError(ValueError):
+    """Raised for a valid file that uses what is not read; the message says what, what is expected and the fix."""
+
+
+def existing_file(function: str, path: str | Path, suffixes: tuple[str, ...], scale: float) -> Path:
+    """Check that a file exists and has a known suffix, and that its scale is positive.
+
+    Args:
+        function: name that error messages begin with.
+        path: file to read.
+        suffixes: known suffixes, in lower case.
+        scale: metres per unit of the file.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: the suffix is unknown, the file is missing, or scale is not above 0.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in suffixes:
+        raise InputError(f"{function}: {path} has suffix {path.suffix!r}; expected one of {', '.join(suffixes)}")
+    if not path.is_file():
+        raise InputError(f"{function}: there is no file {path}; expected an existing file; check the path")
+    checks.positive(function, "scale", scale, "metres per unit of the file")
+    return path
+
+
+@contextmanager
+def reading(function: str, path: Path) -> Iterator[None]:
+    """Turn what a reader raises into an `InputError` that names the file.
+
+    Args:
+        function: name that error messages begin with.
+        path: file that is read.
+
+    Yields:
+        None, while the file is read.
+
+    Raises:
+        InputError: the reader raised.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except UnsupportedError as error:
+        raise InputError(f"{function}: {path} {error}") from error
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise InputError(f"{function}: {path} cannot be opened ({reason}); expected a file you may read") from error
+    except Exception as error:  # what parsers of damaged files raise goes from KeyError to RecursionError
+        reason = str(error) or type(error).__name__
+        suffix = path.suffix.lower()
+        raise InputError(f"{function}: {path} cannot be read as {suffix} ({reason}); save it again") from error
+
+
+def file_bytes(path: Path) -> bytes:
+    """Read the bytes of a file, unless they are plainly of another kind than the suffix says.
+
+    Args:
+        path: file to read.
+
+    Returns:
+        All bytes of the file.
+
+    Raises:
+        OSError: the file cannot be opened.
+        ValueError: the file is empty.
+        UnsupportedError: it is compressed, a web page, or of another format.
+    """
+    data, suffix = path.read_bytes(), path.suffix.lower()
+    if not data:
+        raise ValueError("it is empty, 0 bytes")
+    for magic, (kind, fix) in _FOREIGN.items():
+        if suffix == ".npz":  # itself a zip archive, of arrays
+            break
+        if data[:512].lstrip(b"\xef\xbb\xbf \t\r\n").lower().startswith(magic.lower()):
+            raise UnsupportedError(f"{kind}; expected the content of a {suffix} file; {fix}")
+    for magic, other in _MAGIC.items():
+        if data.startswith(magic) and suffix != other and {suffix, other} != {".glb", ".gltf"}:
+            raise UnsupportedError(f"holds the content of a {other} file; expected {suffix}; rename it to {other}")
+    return data

@@ -1,0 +1,219 @@
+"""Text clouds in the dialects of programs and countries: one cloud, written in all of them."""
+
+import numpy as np
+import pytest
+
+from tdf_jax._internal.errors import InputError
+from tdf_jax.io.pointclouds import load_points
+
+CLOUD = np.random.default_rng(0).uniform(-0.2, 0.2, (40, 3)).round(4) + 0.00001
+POINTS = [[f"{x:.5f}" for x in point] for point in CLOUD]
+
+
+def text(delimiter=" ", head="", before=(), behind=(), rows=POINTS, end="\n", decimal="."):
+    """Rows with columns before and behind the coordinates; a callable makes the entry of a row."""
+    lines = []
+    for i, row in enumerate(rows):
+        extra = [[entry(i) if callable(entry) else entry for entry in entries] for entries in (before, behind)]
+        lines.append(delimiter.join([*extra[0], *row, *extra[1]]).replace(".", decimal))
+    return head + "".join(line + end for line in lines)
+
+
+def index(i):
+    return str(i)
+
+
+def index_from_one(i):
+    return str(i + 1)
+
+
+COLOUR, NORMAL = ("255", "0", "17"), ("0.0", "0.6", "0.8")
+VALID = {
+    "blanks": text(),
+    "many blanks and tabs": text("  \t ", end=" \n\n"),
+    "tabs": text("\t"),
+    "commas": text(","),
+    "commas and blanks": text(", "),
+    "commas at the end": text(",", end=",\n"),
+    "semicolons": text(";"),
+    "semicolons and blanks": text(" ; ", end=" ;\n"),
+    "decimal commas and blanks": text(decimal=","),
+    "decimal commas and tabs": text("\t", decimal=","),
+    "decimal commas and semicolons": text(";", decimal=","),
+    "decimal commas, commas and blanks": text(", ", decimal=","),
+    "decimal commas and some whole numbers": text(behind=("1", "2"), decimal=","),
+    "exponents": text(rows=[[f"{x:.12E}" for x in point] for point in CLOUD]),
+    "exponents of Fortran": text(rows=[[f"{x:.12E}".replace("E", "D") for x in point] for point in CLOUD]),
+    "plus signs": text(rows=[[f"{x:+.5f}" for x in point] for point in CLOUD]),
+    "quoted": text(",", rows=[[f'"{x}"' for x in point] for point in POINTS]),
+    "colours": text(behind=COLOUR),
+    "normals and colours": text(behind=(*NORMAL, *COLOUR)),
+    "normals and a curvature": text(behind=(*NORMAL, "0.0")),
+    "intensity": text(behind=("0.5",)),
+    "homogeneous": text(behind=("1",)),
+    "words behind": text(behind=("mug",)),
+    "comments": text(head="# made by a program\n// a cloud\n% more\n", end=" # point\n"),
+    "a comment of names": text(head="# x y z nx ny nz\n", behind=NORMAL),
+    "a comment of names of CloudCompare": text(head="//X Y Z R G B\n", behind=COLOUR),
+    "names": text(head="x y z\n"),
+    "names with commas": text(",", head="X,Y,Z\n"),
+    "names with blanks, numbers with commas": text(",", head="x y z\n"),
+    "quoted names": text(",", head='"x","y","z","r","g","b"\n', behind=COLOUR),
+    "names with units": text(";", head="x [m];y [m];z [m]\n"),
+    "names of ParaView": text(",", head='"v","Points:0","Points:1","Points:2"\n', before=("0.5",)),
+    "names in another order": text(",", head="z,x,y\n", rows=[[z, x, y] for x, y, z in POINTS]),
+    "coordinates behind others": text(",", head="time,label,x,y,z\n", before=(lambda i: f"{i * 0.1:.1f}", "mug")),
+    "normals before": text(",", head="nx,ny,nz,x,y,z\n", before=NORMAL),
+    "a number of the row without a name": text(",", head=",x,y,z\n", before=(index,)),
+    "names of R": text(head='"x" "y" "z"\n', before=(lambda i: f'"{i + 1}"',)),
+    "names of the point": text(",", head="id,x,y,z\n", before=(lambda i: str(7 * i + 3),)),
+    "numbers from zero": text(before=(index,)),
+    "numbers from one": text(before=(index_from_one,)),
+    "numbers from one, colours behind": text(",", before=(index_from_one,), behind=COLOUR),
+    "numbers from one as floats": text(before=(lambda i: f"{i + 1:.18e}",)),
+    "numbers of whole millimetres": text(before=(index_from_one,), rows=POINTS),
+    "count": text(head="40\n"),
+    "count and intensity, as in .pts": text(head="40\n", behind=("-1200", *COLOUR)),
+    "count and an empty line": text(head="40\n\n"),
+    "count and a title": text(head="40\nscan of a mug\n"),
+    "count of rows and columns": text(head="40 3\n"),
+    "separator line of spreadsheets": text(";", head="sep=;\n", decimal=","),
+    "windows": text(end="\r\n"),
+    "old mac": text(end="\r"),
+    "no newline at the end": text().rstrip(),
+    "utf-8 with a mark": text(head="x y z\n").encode("utf-8-sig"),
+    "utf-16": text(",", head="x,y,z\n").encode("utf-16"),
+    "utf-16 without a mark": text("\t").encode("utf-16-le"),
+    "latin-1": text(head="# Tülle\n").encode("latin-1"),
+    "gbk": text(head="# 杯子\n").encode("gbk"),
+}
+
+
+@pytest.mark.parametrize("name", VALID)
+def test_a_cloud_is_read_in_every_dialect(tmp_path, name):
+    content = VALID[name]
+    (tmp_path / "cloud.xyz").write_bytes(content if isinstance(content, bytes) else content.encode())
+    np.testing.assert_allclose(load_points(tmp_path / "cloud.xyz"), CLOUD, atol=1e-8)
+
+
+@pytest.mark.parametrize("suffix", [".xyz", ".txt", ".csv", ".asc", ".pts", ".XYZ"])
+def test_the_suffixes_of_text(tmp_path, suffix):
+    (tmp_path / f"cloud{suffix}").write_text(text(","))
+    np.testing.assert_allclose(load_points(tmp_path / f"cloud{suffix}"), CLOUD, atol=1e-8)
+
+
+def test_whole_millimetres(tmp_path):
+    """Without decimals every dialect still is one; the first column here counts nothing."""
+    millimetres = np.rint(CLOUD * 1000)
+    rows = [[f"{x:.0f}" for x in point] for point in millimetres]
+    for delimiter in (" ", ",", ";", "\t"):
+        (tmp_path / "cloud.xyz").write_text(text(delimiter, rows=rows))
+        np.testing.assert_allclose(load_points(tmp_path / "cloud.xyz", scale=0.001), millimetres / 1000, atol=1e-8)
+    (tmp_path / "cloud.xyz").write_text(text(",", head="x,y,z,r,g,b\n", behind=COLOUR, rows=rows))
+    np.testing.assert_allclose(load_points(tmp_path / "cloud.xyz", scale=0.001), millimetres / 1000, atol=1e-8)
+
+
+def test_units_of_names_must_match_the_scale(tmp_path):
+    rows = [[f"{x * 1000:.2f}" for x in point] for point in CLOUD]
+    (tmp_path / "cloud.csv").write_text(text(",", head="x [mm],y [mm],z [mm]\n", rows=rows))
+    with pytest.raises(InputError, match=r"coordinates in mm, as its names say; pass scale=0.001"):
+        load_points(tmp_path / "cloud.csv")
+    np.testing.assert_allclose(load_points(tmp_path / "cloud.csv", scale=0.001), CLOUD, atol=1e-7)
+
+
+def test_empty_fields_are_missing_measurements(tmp_path):
+    rows = [["", "", ""] if i in {3, 5} else row for i, row in enumerate(POINTS)]
+    (tmp_path / "cloud.csv").write_text(text(",", head="x,y,z\n", rows=rows))
+    with pytest.raises(InputError, match="2 of the 40 points of .*cloud.csv are NaN"):
+        load_points(tmp_path / "cloud.csv")
+
+
+def molecule(title=""):
+    return text(head=f"40\n{title}\n", before=(lambda i: ("C", "H", "O", "Cl")[i % 4],))
+
+
+UNSUPPORTED = {
+    "molecule": (molecule(), "the word C in line 3, as the files of molecules have"),
+    "molecule with a title": (molecule("water"), "the word C in line 3, as the files of molecules have"),
+    "molecule with numbers as a title": (
+        molecule("1.0 2.0 3.0"),
+        "promises 40 points, and 41 follow|files of molecules",
+    ),
+    "labels": (
+        text(before=(lambda i: str(i % 3),)),
+        "numbers of the points or labels.*; expected x y z first; remove that",
+    ),
+    "numbers with gaps": (
+        text(before=(lambda i: str(3 * i + 5),)),
+        "a first column of whole numbers, which may be numbers",
+    ),
+    "labels of one value": (text(",", before=("7",)), "a first column of whole numbers"),
+    "numbers before two columns": (
+        text(rows=[[str(i), *row[:2]] for i, row in enumerate(POINTS)]),
+        "first column that counts the",
+    ),
+    "decimal commas between commas": (
+        text(",", decimal=","),
+        "6 columns of whole numbers between commas, which may be decimal",
+    ),
+    "commas of thousands": (text(rows=[["1,234.5", *row[1:]] for row in POINTS]), "commas as well as points"),
+    "commas and points": (
+        text(";", rows=[[row[0].replace(".", ","), *row[1:]] for row in POINTS]),
+        "commas as well as points",
+    ),
+    "other names": (
+        text(",", head="lon,lat,height\n"),
+        "first line 'lon,lat,height'; expected numbers, or names of columns",
+    ),
+    "names without z": (text(",", head="x,y,depth\n"), "first line 'x,y,depth'"),
+    "a name twice": (text(",", head="x,y,z,x\n", behind=("1",)), "first line 'x,y,z,x'"),
+    "names for less columns": (
+        text(",", head="x,y,z\n", behind=COLOUR),
+        "names 3 columns in its first line, and has 6",
+    ),
+    "two columns": (text(rows=[row[:2] for row in POINTS]), "has 2 columns; expected x, y and z"),
+    "a depth image": (text(rows=[row * 20 for row in POINTS]), "has 60 columns; expected at most 12"),
+    "a trajectory": (
+        text(before=(lambda i: f"{i * 0.1:.2f}",), behind=("0.0", "0.6", "0.0", "0.8")),
+        "rows that are poses",
+    ),
+    "poses": (text(before=("0.0", "0.6", "0.0", "0.8")), "rows that are poses, with unit quaternions"),
+    "poses, quaternion last": (text(behind=("0.0", "0.6", "0.0", "0.8")), "rows that are poses, with unit quaternions"),
+    "PTX": (text(head="5\n8\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n"), "single whole numbers in its first lines, as PTX has"),
+    "ESRI grid": (text(head="ncols 3\nnrows 40\n"), "first line 'ncols 3'"),
+    "web page": ("<!DOCTYPE html>\n<html>", "is a web page; .* download the file itself"),
+    "pointer of Git LFS": (
+        "version https://git-lfs.github.com/spec/v1\noid sha256:0\n",
+        "a pointer of Git LFS.*run git lfs pull",
+    ),
+    "a .ply": ("ply\nformat ascii 1.0\n", "holds the content of a .ply file; expected .xyz; rename it to .ply"),
+}
+DAMAGED = {
+    "truncated": (text()[:-12], "line 40 has 2 columns, and line 1 has 3"),
+    "a count of more": (text(head="50\n"), "promises 50 points, and 40 follow"),
+    "a count of less": (text(head="30\n"), "promises 30 points, and 40 follow"),
+    "a count of less, with a title": (text(head="30\nscan\n"), "promises 30 points, and 40 follow"),
+    "a word": (text(rows=[*POINTS[:7], ["0.1", "a", "0.2"], *POINTS[8:]]), "line 8: 'a' is no number"),
+    "names twice": (text(",", head="x,y,z\n") + "x,y,z\n", "line 42: 'x' is no number"),
+    "names alone": ("x,y,z\n", "a line of names, and no numbers"),
+    "comments alone": ("# nothing\n\n", "it has no numbers"),
+    "nothing": ("", "it is empty, 0 bytes"),
+    "brackets": (text(rows=[["[" + row[0], *row[1:]] for row in POINTS]), r"'\[.*' is no number|first line '\["),
+}
+
+
+@pytest.mark.parametrize("name", UNSUPPORTED)
+def test_what_is_not_clear_is_named(tmp_path, name):
+    content, message = UNSUPPORTED[name]
+    (tmp_path / "cloud.xyz").write_text(content)
+    with pytest.raises(InputError, match=rf"load_points\(\): .*cloud.xyz .*({message})") as error:
+        load_points(tmp_path / "cloud.xyz")
+    assert "save it again" not in str(error.value) or "molecule" in name
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_damaged_files_say_where(tmp_path, name):
+    content, message = DAMAGED[name]
+    (tmp_path / "cloud.xyz").write_text(content)
+    with pytest.raises(InputError, match=rf"load_points\(\): .*cloud.xyz .*({message})"):
+        load_points(tmp_path / "cloud.xyz")
