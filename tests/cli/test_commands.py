@@ -316,6 +316,23 @@ def test_an_earlier_result_is_replaced(imitate, tmp_path):
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES - {"imitation.png", "loss.png"}
 
 
+def test_a_picture_that_fails_leaves_the_results(weights, tmp_path, monkeypatch, capsys):
+    def broken(*_, **__):
+        raise ValueError("no pictures today\nat all")
+
+    monkeypatch.setattr("tdf_jax.viz.imitation.imitation_figure", broken)
+    with pytest.raises(SystemExit) as stop:
+        run("imitate", "--weights", weights, "--out", tmp_path / "out", *TINY)
+    assert stop.value.code == 1
+    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES - {"imitation.png"}
+    assert record_of(tmp_path / "out")["best"] in range(STARTS)
+    out, error = capsys.readouterr()
+    assert "written to" in out and error.splitlines()[-1] == (
+        "tdf: error: tdf imitate: imitation.png is missing (ValueError: no pictures today). All other results are "
+        "complete"
+    )
+
+
 # Bad input
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 import sys
 
@@ -50,6 +51,25 @@ def test_a_run_writes_every_file_and_nothing_beside_them(weights, tmp_path, grid
     assert found.values.shape[1:] == found.grid.shape
     assert about["settings"]["grid"] == grid
     assert np.isnan(found.values).any() == (grid == "path")
+
+
+@pytest.mark.parametrize("grid", ["yz", pytest.param("volume", marks=pytest.mark.slow)])
+def test_pictures_that_fail_leave_the_results(weights, tmp_path, monkeypatch, capsys, grid):
+    def broken(*_, **__):
+        raise ValueError("no pictures today")
+
+    pictures = {"yz": {"map.png"}, "volume": {"isosurface.png", "slices.gif"}}[grid] | {"landscape.html"}
+    monkeypatch.setattr("tdf_jax.viz.landscapes.Marks", broken)
+    monkeypatch.setattr("tdf_jax.viz.html.pages", lambda _: None)  # also where plotly is not installed
+    with pytest.raises(SystemExit) as stop:
+        run("landscape", "--weights", weights, "--out", tmp_path / "out", "--grid", grid, *QUICK)
+    assert stop.value.code == 1
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", "landscape.npz"}
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert re.findall(r"([\w.]+) is missing \(ValueError: no pictures today\)", error) == sorted(
+        pictures, key=error.index
+    )
 
 
 def test_the_record_and_the_landscape_agree(sweep):
