@@ -5,7 +5,7 @@ import io
 import numpy as np
 from jaxtyping import Float
 
-from tdf_jax.io.columns import coordinate_columns, named_columns
+from tdf_jax.io.columns import MOST_COLUMNS, coordinate_columns, named_columns
 from tdf_jax.io.content import UnsupportedError
 
 _NAMES = ("points", "xyz", "pointcloud", "point_cloud", "cloud", "pc", "coords", "coordinates", "position", "positions")
@@ -71,7 +71,7 @@ def array_points(array: np.ndarray) -> Float[np.ndarray, "points 3"]:
     """Take the points from an array, if it is clear which numbers they are.
 
     Args:
-        array: numbers, (points, 3); (points, 4 to 12) with x y z first, as `coordinate_columns` takes them;
+        array: numbers, (points, 3); (points, 4 to 20) with x y z first, as `coordinate_columns` takes them;
             (3, points); (4, points) with a last row of ones; (height, width, 3 or more), if neighbours in both
             directions are near each other; or an array with the fields x, y and z.
 
@@ -96,11 +96,11 @@ def array_points(array: np.ndarray) -> Float[np.ndarray, "points 3"]:
             "numbers are x y z of one point after the other"
         )
     rows, columns = values.shape
-    if rows == 3 != columns or (rows == 4 and columns > 12 and (values[3] == 1).all()):
+    if rows == 3 != columns or (rows == 4 < columns and (values[3] == 1).all()):
         return values[:3].T
-    if rows <= 12 < columns:
+    if rows <= MOST_COLUMNS < columns:
         raise UnsupportedError(f"has shape {array.shape}; expected (points, 3); save points[:3].T if x y z are first")
-    if columns < 3 or columns > 12:
+    if columns < 3 or columns > MOST_COLUMNS:
         raise UnsupportedError(
             f"has shape {array.shape}; expected (points, 3); save points[:, :3] if x y z are first, and the points of "
             "the depths if this is a depth image"

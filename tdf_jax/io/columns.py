@@ -1,5 +1,6 @@
 """Columns of numbers, in text and in arrays: which of them are x, y and z."""
 
+import csv
 import re
 from collections.abc import Sequence
 
@@ -10,7 +11,7 @@ from tdf_jax.io.content import UnsupportedError
 from tdf_jax.io.text import decode, numbers
 
 _COMMENTS = ("#", "//", "%", "!")
-_MOST = 12  # columns, as in x y z, a normal, a colour with alpha, and two more; a depth image has hundreds
+MOST_COLUMNS = 20  # with a normal, a colour, an intensity and some features; a depth image has hundreds
 # x, "X", x [mm], x_mm, Points:0 and the like. What stands behind the axis is a unit.
 _NAME = re.compile(
     r"(?:points?[_:. ]*|pos(?:ition)?[_:. ]*|coord[_:. ]*)?([xyz012])[\s_]*(?:[\[(/]?\s*([a-z]+)\s*[\])]?)?"
@@ -18,6 +19,7 @@ _NAME = re.compile(
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "dm": 1e-1, "m": 1.0, "km": 1e3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 _UNITS |= {"metre": 1.0, "metres": 1.0, "meter": 1.0, "meters": 1.0, "inch": 0.0254, "inches": 0.0254}
 _UNITS |= {"millimetres": 1e-3, "millimeters": 1e-3, "centimetres": 1e-2, "centimeters": 1e-2}
+_MISSING = {"", "null", "none", "na", "n/a", "-", "--"}
 _MIXED = "has numbers with commas as well as points; expected decimal points only; remove the commas"
 _HEADER_FIX = "write the names of the columns into the first line, such as x y z"
 
@@ -47,7 +49,7 @@ def read_columns(data: bytes, scale: float = 1.0) -> Float[np.ndarray, "points 3
     delimiter, comma = _dialect([row for _, row in rows[1:21] or rows])
     header = _header(rows, delimiter, comma)
     if header is not None:
-        rows, names = rows[1:], header
+        rows, names = rows[1:], [header]
         if not rows:
             raise ValueError("it has a line of names, and no numbers")
     table = [_split(row, delimiter, comma) for _, row in rows]
@@ -55,8 +57,13 @@ def read_columns(data: bytes, scale: float = 1.0) -> Float[np.ndarray, "points 3
         table = [row[:-1] for row in table]  # a delimiter at the end of each line
     width = len(table[0])
     for (number, _), row in zip(rows, table):
+        if row is table[-1] and len(row) < width:
+            raise ValueError(f"it ends within line {number}, which has {len(row)} columns and not {width}")
         if len(row) != width:
-            raise ValueError(f"line {number} has {len(row)} columns, and line {rows[0][0]} has {width}")
+            raise UnsupportedError(
+                f"has {len(row)} columns in line {number}, and {width} in line {rows[0][0]}; expected one point x y z, "
+                "and the same numbers behind it, in each line"
+            )
     if comma and any(re.fullmatch(r"[+-]?\d*\.\d+", cell) for row in table for cell in row):
         raise UnsupportedError(_MIXED)
     _refuse_molecule(table, rows)
@@ -72,7 +79,7 @@ def read_columns(data: bytes, scale: float = 1.0) -> Float[np.ndarray, "points 3
     if width < 3:
         raise UnsupportedError(f"has {width} columns; expected x, y and z in each line")
     values = np.full((len(table), width), np.nan)
-    for column in range(width if width <= _MOST else 0):
+    for column in range(width if width <= MOST_COLUMNS else 0):
         try:
             values[:, column] = _values(table, [column], rows)[:, 0]
         except ValueError:  # behind the coordinates there may be words
@@ -97,10 +104,12 @@ def coordinate_columns(values: Float[np.ndarray, "rows columns"]) -> Float[np.nd
     rows, width = values.shape
     if width < 3:
         raise UnsupportedError(f"has {width} columns; expected x, y and z in each row")
-    if width > _MOST:
-        raise UnsupportedError(f"has {width} columns; expected at most {_MOST}, x y z first; keep the first three")
+    if width > MOST_COLUMNS:
+        raise UnsupportedError(
+            f"has {width} columns; expected at most {MOST_COLUMNS}, x y z first; keep the first three"
+        )
     whole = [np.isfinite(column).all() and (column == np.rint(column)).all() for column in values.T[:4]]
-    counts = rows > 1 and whole[0] and values[0, 0] in {0, 1} and (np.diff(values[:, 0]) == 1).all()
+    counts = _count_rows(values[:, 0])
     if width == 3:
         if counts:
             raise UnsupportedError("has a first column that counts the rows, and two more; expected x, y and z")
@@ -113,7 +122,7 @@ def coordinate_columns(values: Float[np.ndarray, "rows columns"]) -> Float[np.nd
             f"are not; expected x y z first; remove that column, or {_HEADER_FIX}"
         )
     if _are_poses(values):
-        raise UnsupportedError("has rows that are poses, with unit quaternions; expected points x y z")
+        raise UnsupportedError("has rows that are poses, or quaternions of norm 1; expected points x y z")
     return values[:, :3]
 
 
@@ -142,14 +151,13 @@ def named_columns(names: Sequence[str]) -> tuple[list[int], str | None] | None:
 
 
 def _lines(text):
-    """Numbered lines with data, and the names of the columns if a comment above them gives some."""
-    rows, names = [], None
+    """Numbered lines with data, and what may be the names of their columns, if a comment above them gives some."""
+    rows, names = [], []
     for number, line in enumerate(text.split("\n"), 1):
         line = line.strip()
         if line.startswith(_COMMENTS):
-            words = re.split(r"[,;\s]+", line.lstrip("#/%! \t"))
-            if not rows and named_columns(words):
-                names = words
+            if not rows:
+                names += [re.split(delimiter, line.lstrip("#/%! \t")) for delimiter in (";", ",", "\t", r"[,;\s]+")]
             continue
         line = line.partition("#")[0].strip()
         if line and not (not rows and line.lower().startswith("sep=")):  # that line is for spreadsheets
@@ -162,22 +170,23 @@ def _without_count(rows):
     if len(rows) < 2 or not re.fullmatch(r"\d+(\s+\d+)?", rows[0][1]):
         return rows
     count, *width = (int(word) for word in rows[0][1].split())
-    title = not _is_number(re.split(r"[,;\s]+", rows[1][1])[0])
+    _refuse_molecule([row.split() for _, row in rows[2:]], rows[2:])
+    words = re.split(r"[,;\s]+", rows[1][1])
     if width:  # rows and columns
-        return rows[1:] if count == len(rows) - 1 and width[0] == len(re.split(r"[,;\s]+", rows[1][1])) else rows
+        return rows[1:] if count == len(rows) - 1 and width[0] == len(words) else rows
     if re.fullmatch(r"\d+", rows[1][1]):
         raise UnsupportedError("has single whole numbers in its first lines, as PTX has; expected x y z in each line")
+    title = not _is_number(words[0])
     if title and len(rows) - 2 == count:
         return rows[2:]
     if len(rows) - 1 != count:
-        if title:
-            _refuse_molecule([row.split() for _, row in rows[2:]], rows[2:])
         raise ValueError(f"its first line promises {count} points, and {len(rows) - 1 - title} follow")
     return rows[1:]
 
 
 def _dialect(rows):
     """The delimiter, None for white space, and whether commas are decimal."""
+    rows = [row.replace('"', "") for row in rows]
     text = "\n".join(rows)
     if ";" in text:
         return ";", "," in text
@@ -199,6 +208,8 @@ def _dialect(rows):
 def _split(row, delimiter, comma):
     if delimiter is None:
         cells = [cell.rstrip(",") for cell in row.split()] if comma else row.split()
+    elif '"' in row:  # where a delimiter is no delimiter
+        cells = [cell.strip() for cell in next(csv.reader([row], delimiter=delimiter, skipinitialspace=True))]
     else:
         cells = [cell.strip() for cell in row.split(delimiter)]
     return [cell.strip("\"'") for cell in cells] if '"' in row or "'" in row else cells
@@ -215,7 +226,7 @@ def _is_number(cell):
 def _header(rows, delimiter, comma):
     """Names in the first line, None if it has numbers only."""
     cells = _split(rows[0][1], delimiter, comma)
-    if all(_is_number(cell) for cell in cells if cell):
+    if all(_is_number(cell) or cell.lower() in _MISSING for cell in cells):
         return None
     for names in (cells, re.split(r"[,;\t]\s*|\s+", rows[0][1])):
         if named_columns(names):
@@ -227,35 +238,52 @@ def _header(rows, delimiter, comma):
     )
 
 
-def _named(names, table, scale, required):
+def _named(candidates, table, scale, required):
     """Indices of the columns that are named x, y and z, None if there are no names."""
-    found, width = names and named_columns(names), len(table[0])
-    if not found:
-        return None
-    columns, unit = found
-    if len(names) == width - 1 and required:  # the column of row names has none, as in R
+    found = [(len(names), named) for names in candidates if (named := named_columns(names))]
+    width = len(table[0])
+    fitting = [named for count, named in found if count == width]
+    if fitting:
+        columns, unit = fitting[-1]
+    elif required and found[0][0] == width - 1 and _are_row_names([row[0] for row in table]):
+        columns, unit = found[0][1]  # the column of row names has none, as in R
         columns = [column + 1 for column in columns]
-    elif len(names) != width:
-        if required:
-            raise UnsupportedError(
-                f"names {len(names)} columns in its first line, and has {width}; expected one name each"
-            )
+    elif required:
+        raise UnsupportedError(
+            f"names {found[0][0]} columns in its first line, and has {width}; expected one name each"
+        )
+    else:
         return None
     if unit and _UNITS[unit] != 1 and scale == 1:
         raise UnsupportedError(f"has coordinates in {unit}, as its names say; pass scale={_UNITS[unit]:g}")
     return columns
 
 
+def _are_row_names(cells):
+    if not all(_is_number(cell) for cell in cells):
+        return True
+    return bool(_count_rows(numbers(cells)))
+
+
+def _count_rows(values):
+    """Whether values are the numbers of the rows, from 0 or from 1."""
+    return len(values) > 1 and values[0] in {0, 1} and (np.diff(values) == 1).all()
+
+
 def _values(table, columns, rows):
     """Numbers of some columns, (rows, columns); NaN where a field is empty."""
-    cells = [row[column] or "nan" for row in table for column in columns]
+    cells = [row[column] for row in table for column in columns]
     try:
         return numbers(cells).reshape(-1, len(columns))
     except UnsupportedError:
         raise
-    except ValueError as error:
-        wrong = next(i for i, cell in enumerate(cells) if not _is_number(cell))
-        raise ValueError(f"line {rows[wrong // len(columns)][0]}: {error}") from None
+    except ValueError:
+        cells = ["nan" if cell.lower() in _MISSING else cell for cell in cells]
+        wrong = next((i for i, cell in enumerate(cells) if not _is_number(cell)), None)
+        if wrong is not None:
+            line = rows[wrong // len(columns)][0]
+            raise UnsupportedError(f"has {cells[wrong][:80]!r} in line {line}; expected a number") from None
+        return numbers(cells).reshape(-1, len(columns))
 
 
 def _refuse_molecule(table, rows):
@@ -273,6 +301,8 @@ def _are_poses(values):
         return len(values) > 0 and bool((np.abs(np.linalg.norm(values[:, columns], axis=1) - 1) < 1e-3).all())
 
     match values.shape[1]:
+        case 4:
+            return unit(slice(0, 4))
         case 7:  # wxyz_xyz, or the quaternion last; normals and a curvature may also be of norm 1
             return unit(slice(0, 4)) or (unit(slice(3, 7)) and not unit(slice(3, 6)))
         case 8:  # the TUM format, with the time first

@@ -83,7 +83,7 @@ def _container(data):
         start += size
     if b"JSON" not in chunks:
         raise ValueError("it has no chunk JSON")
-    return json.loads(chunks[b"JSON"].decode("utf-8-sig")), chunks.get(b"BIN\0")
+    return json.loads(chunks[b"JSON"].rstrip(b"\0").decode("utf-8-sig")), chunks.get(b"BIN\0")
 
 
 class _Asset:

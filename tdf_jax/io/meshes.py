@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb", ".gltf", ".off")
 AXES = {sign + name: {"+": 1.0, "-": -1.0}[sign] * np.eye(3)[i] for i, name in enumerate("xyz") for sign in "+-"}
+_FARTHEST = 1e10  # units; trimesh compares vertices as whole numbers of 1e-8, which end at 9e10
 _READERS = {".obj": read_obj, ".stl": read_stl, ".ply": read_ply, ".off": read_off}
 
 
@@ -110,7 +111,7 @@ def joined_mesh(
         The mesh, metres.
 
     Raises:
-        InputError: a vertex of a face is not finite.
+        InputError: a vertex of a face is not finite, or farther away than vertices can be merged.
     """
     import trimesh
 
@@ -119,6 +120,11 @@ def joined_mesh(
     vertices, faces = vertices[used], (np.cumsum(used) - 1)[faces]
     if not np.isfinite(vertices).all():
         raise InputError(f"{function}: {path} has vertices that are NaN or infinite; expected finite coordinates")
+    if np.abs(vertices).max() > _FARTHEST:
+        raise InputError(
+            f"{function}: {path} has vertices up to {np.abs(vertices).max():.3g} from the origin; expected at most "
+            f"{_FARTHEST:g} units; the file is damaged, or a vertex of it is"
+        )
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.merge_vertices()
     return mesh.apply_scale(scale)

@@ -43,12 +43,14 @@ def read_off(data: bytes) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarr
     if not rows or len(rows[0].split()) not in {2, 3}:
         raise ValueError("it does not begin by OFF and the numbers of vertices, faces and edges")
     num_vertices, num_faces = (int(count) for count in indices(rows[0].split())[:2])
-    if min(num_vertices, num_faces) < 0 or len(rows) - 1 != num_vertices + num_faces:
+    table = [row.split() for row in rows[1:]]
+    if len(table) != num_vertices + num_faces and not (keyword and keyword[0].strip() != "OFF"):
+        table = _rewrapped([word for row in table for word in row], num_vertices, num_faces) or table
+    if min(num_vertices, num_faces) < 0 or len(table) != num_vertices + num_faces:
         raise ValueError(
-            f"it promises {num_vertices} vertices and {num_faces} faces, and has {len(rows) - 1} lines for them"
+            f"it promises {num_vertices} vertices and {num_faces} faces, and has {len(table)} lines for them"
         )
-    points = [row.split() for row in rows[1 : num_vertices + 1]]
-    polygons = [row.split() for row in rows[num_vertices + 1 :]]
+    points, polygons = table[:num_vertices], table[num_vertices:]
     if any(len(point) < 3 for point in points):
         raise ValueError("it has a vertex of less than three numbers")
     vertices = numbers([number for point in points for number in point[:3]]).reshape(-1, 3)
@@ -57,3 +59,14 @@ def read_off(data: bytes) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarr
         raise ValueError("it has a face with less corners than its first number promises")
     corners = [corner for size, polygon in zip(sizes, polygons) for corner in polygon[1 : size + 1]]
     return vertices, triangulate(vertices, indices(corners), sizes)
+
+
+def _rewrapped(words, num_vertices, num_faces):
+    """Rows of a file whose lines end anywhere, which is allowed without colours; None if it is none."""
+    rows, start = [words[3 * i : 3 * i + 3] for i in range(max(num_vertices, 0))], 3 * num_vertices
+    for _ in range(num_faces):
+        if not 0 <= start < len(words) or not words[start].isdecimal():
+            return None
+        rows.append(words[start : start + int(words[start]) + 1])
+        start += int(words[start]) + 1
+    return rows if start == len(words) else None

@@ -26,7 +26,7 @@ def read_pcd(data: bytes) -> Float[np.ndarray, "points 3"]:
         UnsupportedError: it has no fields x, y and z, or a viewpoint other than the origin.
     """
     header, body = _header(data)
-    fields, count = header["FIELDS"], _count(header)
+    fields, count = [name.lower() for name in header["FIELDS"]], _count(header)
     lengths = [int(length) for length in header.get("COUNT", ["1"] * len(fields))]
     if len(lengths) != len(fields):
         raise ValueError(f"its header has {len(fields)} FIELDS and {len(lengths)} entries of COUNT")
@@ -161,7 +161,12 @@ def _packed_columns(body, fields, types, lengths, count):
     sizes = [count * sum(types[i].itemsize * lengths[i] for i in layout) for layout in layouts]
     if size not in sizes:
         raise ValueError(f"its data is {size} bytes when unpacked; {count} points are {sizes[0]}")
-    raw = decompress_lzf(body[8 : 8 + packed], size)
+    raw = body[8 : 8 + packed]
+    try:
+        raw = decompress_lzf(raw, size)
+    except ValueError:
+        if packed != size:  # some programs write the data as it is if it does not become smaller
+            raise
     columns, start = {}, 0
     for i in layouts[sizes.index(size)]:  # one field of all points after the other
         columns[fields[i]] = np.frombuffer(raw, types[i], count * lengths[i], start)

@@ -99,7 +99,7 @@ def _header(data):
         match line.split():
             case ["comment" | "obj_info", *_]:
                 pass
-            case ["format", name, _] if name in _ORDERS:
+            case ["format", name, *_] if name in _ORDERS:
                 order = _ORDERS[name]
             case ["element", name, count] if count.isdecimal():
                 elements.append(_Element(name.lower(), int(count), [], [], []))

@@ -58,6 +58,8 @@ def load_points(
             if not mesh.area > 0:
                 raise InputError(f"{function}: {path} has {len(faces)} faces without area; expected a surface")
             return _rounded(checks.points(function, sample_surface(mesh, count or 1500, rng), str(path)))
+        if not len(points):
+            raise InputError(f"{function}: {path} has neither faces nor points; expected a surface or a cloud")
     else:
         points = _read_cloud(function, path, scale)
     if drop_invalid:

@@ -41,8 +41,9 @@ def decode(data: bytes) -> str:
         except UnicodeDecodeError:  # Latin-1 knows every byte: GBK and Shift-JIS come out as noise, numbers do not
             text = data.decode("latin-1")
     else:
-        text = data.decode(encoding, "replace").removeprefix("\ufeff")
-    return text.replace("\r\n", "\n").replace("\r", "\n")
+        text = data.decode(encoding, "replace")
+    # The mark may also stand where files have been joined.
+    return text.replace("\ufeff", "").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def lines(text: str, comment: str | None = "#") -> list[str]:

@@ -32,6 +32,7 @@ VALID = {
     "NOFF": off("NOFF\n7 7 0\n", " 0 0 1"),
     "CNOFF": off("CNOFF\n7 7 0\n", " 0 0 1 255 0 0 255"),
     "STOFF": off("STOFF\n7 7 0\n", " 0.5 0.5"),
+    "lines that end anywhere": off().replace("\n", " ").replace("OFF ", "OFF\n").replace("7 7 0 ", "7 7 0\n"),
     "points and lines among the faces": off("OFF\n7 9 0\n", faces=["1 0", "2 0 1", *FACES]),
     "windows": off().replace("\n", "\r\n"),
     "tabs": off().replace(" ", "\t"),

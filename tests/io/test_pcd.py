@@ -92,6 +92,11 @@ VALID = {
         TYPE="F F F",
         COUNT="1 1 1",
     ),
+    "compressed in vain": pcd("binary_compressed", packed(pack=bytes)),
+    "capital fields": pcd("binary", ROWS.tobytes(), FIELDS="X Y Z RGB"),
+    "padding of no bytes": pcd(
+        "binary", ROWS.tobytes(), FIELDS="x y z _ rgb _", SIZE="4 4 4 1 4 1", TYPE="F F F U U U", COUNT="1 1 1 0 1 0"
+    ),
     "fields in another order": pcd(
         "binary", CLOUD[:, [2, 0, 1]].tobytes(), FIELDS="z x y", SIZE="4 4 4", TYPE="F F F", COUNT="1 1 1"
     ),

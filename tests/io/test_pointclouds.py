@@ -164,6 +164,20 @@ def test_a_mesh_without_faces_is_a_cloud(tmp_path, suffix):
         load_mesh(path)
 
 
+@pytest.mark.parametrize("content", ["# nothing\n", "o mug\nvn 0 0 1\n"])
+def test_a_mesh_without_vertices_is_named(tmp_path, content):
+    (tmp_path / "mug.obj").write_text(content)
+    with pytest.raises(InputError, match="mug.obj has neither faces nor points; expected a surface or a cloud"):
+        load_points(tmp_path / "mug.obj")
+
+
+def test_vertices_that_are_damaged_are_named(tmp_path):
+    (tmp_path / "mug.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1e30 0\nf 1 2 3\n")
+    for load in (load_mesh, load_points):
+        with pytest.raises(InputError, match=r"mug.obj has vertices up to 1e\+30 from the origin; expected at most"):
+            load(tmp_path / "mug.obj")
+
+
 FAR = np.array([412345.0, 5412345.0, 120.0])
 
 
