@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterable
 from typing import Any, TypeVar, cast
 
 import jax
+import jax.core
+import jax.numpy as jnp
 import numpy as np
 
 from tdf_jax._internal.devices import platform_problem
@@ -37,13 +39,24 @@ _calls = threading.local()  # whether a call of this thread has crossed the boun
 
 
 def public(function: F) -> F:
-    """Decorator of a public function or method that computes with JAX.
+    """Decorator of a public function or method.
 
     The caller's `jax_numpy_rank_promotion`, `jax_numpy_dtype_promotion`, `jax_transfer_guard` and `jax_debug_infs` do
     not apply inside. Arguments that are arrays of other libraries become numpy arrays, see `plain_array`. An
-    `InputError` names the function if it needs numbers that are traced, or if JAX has no device to run on. Functions of
-    numpy alone need no decorator.
+    `InputError` names the function if it needs numbers that are traced, or if JAX has no device to run on.
     """
+    return _guarded(function, host=False)
+
+
+def host(function: F) -> F:
+    """Decorator of a public function that cannot be a part of a traced one, because it runs programs of its own.
+
+    As `public`, but a call inside of `jax.jit` is refused before anything is computed.
+    """
+    return _guarded(function, host=True)
+
+
+def _guarded(function: F, host: bool) -> F:
     name = function.__qualname__.removesuffix(".__post_init__") + "()"
 
     @functools.wraps(function)
@@ -54,6 +67,8 @@ def public(function: F) -> F:
         try:
             with own_settings():
                 arguments, keywords = _plain(function, name, arguments, keywords)
+                if host and isinstance(jnp.zeros(()), jax.core.Tracer):
+                    raise InputError(f"{name}: {_traced(function, arguments, keywords)}")
                 return function(*arguments, **keywords)
         except InputError:
             raise
@@ -151,14 +166,11 @@ def _traced(function, arguments: tuple, keywords: dict) -> str:
     """What to do about numbers that are not known because a transformation of JAX traces them."""
     bound = inspect.signature(function).bind_partial(*arguments, **keywords).arguments
     names = [name for name, value in bound.items() if any(isinstance(one, jax.core.Tracer) for one in _leaves(value))]
-    why = "expected known numbers, with which it computes outside of JAX"
+    why = "expected known numbers"
     if names:
         got = f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} traced by jax.jit, jax.vmap or jax.grad"
         return f"{got}; {why}. Call it outside of the function that is traced"
-    return (
-        f"it is called inside a function that jax.jit traces; {why}. Call it outside of that function, and pass its "
-        "result in"
-    )
+    return f"it is called inside a function that jax.jit traces; {why}. Call it outside of it, and pass its result in"
 
 
 def _leaves(value) -> Iterable[Any]:

@@ -40,6 +40,21 @@ def points_at_a_time(cpu_points: int) -> int:
     return cpu_points if one_at_a_time() else ACCELERATOR_POINTS
 
 
+def platform_problem() -> str | None:
+    """Why JAX has no device to run on and what to do about it, as the end of an error message; None if it has one."""
+    try:
+        jax.devices()
+    # JAX raises the second if the only platform that it may use is `cuda`, and its plugin is not installed.
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0] if str(error) else "none is installed"
+        wanted = jax.config.jax_platforms  # pyright: ignore[reportAttributeAccessIssue]: added at run time
+        return (
+            f"JAX has no device of the platform {wanted!r}, which JAX_PLATFORMS or jax_platforms asks for ({reason}); "
+            "expected an available one. Unset JAX_PLATFORMS or set it to cpu, or install the JAX of your accelerator"
+        )
+    return None
+
+
 def check_device_mesh(function: str, device_mesh) -> None:
     """Raise InputError unless the argument `device_mesh` is a mesh or None."""
     if device_mesh is not None and not isinstance(device_mesh, Mesh):

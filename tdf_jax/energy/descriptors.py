@@ -4,11 +4,13 @@ import jax
 from jaxtyping import Array, Float
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.networks.field import DescriptorField
 
 
+@public
 def pose_descriptor(
     field: DescriptorField, T_world_query: Float[Array, "7"], query: Float[Array, "queries 3"]
 ) -> Float[Array, "queries channels"]:
@@ -29,6 +31,7 @@ def pose_descriptor(
     return field.descriptors(se3.transform(T_world_query, query))
 
 
+@public
 def trajectory_descriptor(
     field: DescriptorField, trajectory: Trajectory, query: Float[Array, "queries 3"]
 ) -> Float[Array, "poses queries channels"]:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.deprecation import renamed_fields, renamed_keywords
 from tdf_jax.energy.reference import Reference
 from tdf_jax.geometry import se3
@@ -63,6 +64,7 @@ class EnergyWeights:
                 checks.number("EnergyWeights()", name, value, least=0)
 
 
+@public
 def trajectory_energy(
     trajectory: Trajectory, field: DescriptorField, reference: Reference, weights: EnergyWeights
 ) -> Float[Array, ""]:
@@ -81,6 +83,7 @@ def trajectory_energy(
     return descriptor_loss(trajectory, field, reference) + pose_energy(R, t, field.origin, reference, weights)
 
 
+@public
 def descriptor_loss(trajectory: Trajectory, field: DescriptorField, reference: Reference) -> Float[Array, ""]:
     """l_t of eq. 2: mean absolute difference of descriptors over poses, queries and channels.
 
@@ -148,6 +151,7 @@ def pose_energy(
     return weights.correlation * correlation + weights.compensator * _compensator(R, t, weights.compensator_order)
 
 
+@public
 @renamed_keywords(lever="rotation_scale")
 def correlation_loss(
     trajectory: Trajectory,
@@ -173,6 +177,7 @@ def correlation_loss(
     return _correlation(trajectory.rotations, trajectory.translations, origin, reference, rotation_scale, pose_norm)
 
 
+@public
 def compensator_loss(trajectory: Trajectory, order: str = "frobenius") -> Float[Array, ""]:
     """l_p of eq. 6: sum over neighbouring waypoints of ||T_i^-1 T_{i+1} - I||_F.
 

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.winding import libigl, winding_number
@@ -40,6 +41,7 @@ class Box:
     T_world_box: Float[Array, "7"]
     size: Float[Array, "3"]
 
+    @public
     def distance(self, x: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
         """Compute exact signed distances.
 
@@ -83,6 +85,7 @@ class DistanceGrid:
     pitch: Float[Array, ""]
     values: Float[Array, "x y z"]
 
+    @public
     def distance(self, x: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
         """Interpolate signed distances between the eight nodes around a point.
 
@@ -117,6 +120,7 @@ class DistanceGrid:
         return interpolated + self.pitch * jnp.where(within, 0.0, jnp.sqrt(jnp.where(within, 1.0, square)))
 
 
+@public
 def box_obstacle(centre: ArrayLike, size: ArrayLike, rotation: ArrayLike | None = None) -> Box:
     """Make an obstacle of a box, such as a table, a wall or a board of a shelf.
 
@@ -139,6 +143,7 @@ def box_obstacle(centre: ArrayLike, size: ArrayLike, rotation: ArrayLike | None 
     return Box(jnp.concatenate([wxyz, middle]), edges)
 
 
+@public
 def mesh_obstacle(mesh: "trimesh.Trimesh", pitch: float = 0.01, pad: float = 0.05) -> DistanceGrid:
     """Make an obstacle of a mesh, closed or open.
 
@@ -179,6 +184,7 @@ def mesh_obstacle(mesh: "trimesh.Trimesh", pitch: float = 0.01, pad: float = 0.0
     return tabulated("mesh_obstacle()", vertices[faces].reshape(-1, 3), pitch, pad, signed)
 
 
+@public
 def cloud_obstacle(
     points: Float[Array, "points 3"], radius: float = 0.005, pitch: float = 0.005, pad: float = 0.05
 ) -> DistanceGrid:

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.trajectory import Trajectory
 
@@ -95,6 +96,7 @@ class Grid:
         return self.origin + mesh @ self.directions
 
 
+@public
 def plane_grid(
     half: float,
     count: int = 101,
@@ -129,6 +131,7 @@ def plane_grid(
     return Grid(centre, np.asarray(axes), (steps, steps))
 
 
+@public
 def volume_grid(
     half: float,
     count: int = 64,
@@ -155,6 +158,7 @@ def volume_grid(
     return Grid(centre, np.eye(3) if axes is None else np.asarray(axes), (steps, steps, steps))
 
 
+@public
 def path_grid(
     path: Trajectory | Float[np.ndarray, "poses 3"],
     radius: float,

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.deprecation import renamed_keywords
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
@@ -19,6 +20,7 @@ from tdf_jax.geometry.trajectory import Trajectory, resample
 UPRIGHT = 0.6  # fraction of the way from start to end after which `tilt_and_pour` begins to tilt
 
 
+@public
 @renamed_keywords(poses="num_poses")
 def line(
     num_poses: int = 7,
@@ -47,6 +49,7 @@ def line(
     return _along_curve("line()", num_poses, start, end, rotation, end_rotation, lambda s, chord: (s * chord, 0 * s))
 
 
+@public
 @renamed_keywords(poses="num_poses")
 def semicircle(
     num_poses: int = 7,
@@ -88,6 +91,7 @@ def semicircle(
     return _along_curve("semicircle()", num_poses, start, end, rotation, end_rotation, arc, height, bulge)
 
 
+@public
 @renamed_keywords(poses="num_poses")
 def wave(
     num_poses: int = 7,
@@ -130,6 +134,7 @@ def wave(
     return _along_curve("wave()", num_poses, start, end, rotation, end_rotation, sine, height, bulge)
 
 
+@public
 @renamed_keywords(poses="num_poses")
 def lift_over(
     num_poses: int = 7,
@@ -165,6 +170,7 @@ def lift_over(
     )
 
 
+@public
 @renamed_keywords(poses="num_poses")
 def tilt_and_pour(
     num_poses: int = 7,
@@ -215,6 +221,7 @@ def tilt_and_pour(
     )
 
 
+@public
 @renamed_keywords(poses="num_poses")
 def hang_on_rack(
     num_poses: int = 7,

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from numpy.typing import ArrayLike
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
 
 # Below these squares a power series replaces the quotient 0/0. They are large on purpose, so that second derivatives
 # are accurate too; the omitted terms are below 1e-16.
@@ -127,6 +128,7 @@ def uniform_rotations(key: PRNGKeyArray, count: int) -> Float[Array, "count 3 3"
     return matrix_from_wxyz(jax.random.normal(key, (count, 4)))
 
 
+@public
 def rotation_grid(count: int) -> Float[np.ndarray, "count 3 3"]:
     """Spread rotations evenly over SO(3); the grid is the same in every call.
 
@@ -153,6 +155,7 @@ def rotation_grid(count: int) -> Float[np.ndarray, "count 3 3"]:
     return np.asarray(matrix_from_wxyz(wxyz))
 
 
+@public
 def turns(axis: ArrayLike, count: int, start: Float[Array, "3 3"] | None = None) -> Float[np.ndarray, "count 3 3"]:
     """Rotate an orientation about one axis in even steps, once around: a slice of SO(3).
 

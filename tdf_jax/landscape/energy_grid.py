@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import host
 from tdf_jax._internal.deprecation import renamed_keywords
 from tdf_jax._internal.devices import check_device_mesh
 from tdf_jax._internal.errors import InputError
@@ -21,6 +22,7 @@ from tdf_jax.networks.field import DescriptorField
 OVER_ROTATIONS = ("best", "each")
 
 
+@host
 @renamed_keywords(mesh="device_mesh")
 def energy_landscape(
     field: DescriptorField,

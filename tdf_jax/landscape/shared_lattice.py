@@ -240,7 +240,7 @@ def _tile(field, references, axes, shifts, first, bases, size, span):
                 for channel in range(unrolled):
                     # Each channel has its own slice. XLA would copy one slice of all channels, and the copy takes as
                     # long as the sum.
-                    shifted = jax.lax.dynamic_slice(here, (channel, *shift), (1, *size))
+                    shifted = jax.lax.dynamic_slice(here, (jnp.int32(channel), *shift), (1, *size))
                     part += jnp.abs(shifted - reference[channel].reshape(-1, *[1] * len(size)))
                 return sums + part
 

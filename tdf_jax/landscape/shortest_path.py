@@ -8,12 +8,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.errors import InputError
 from tdf_jax.landscape.storage import Landscape
 
 SHARPEST = 50.0  # energies differ by a factor of about 10, so costs span 50 decades of the 300 of float64
 
 
+@public
 def lowest_cost_path(
     landscape: Landscape, start: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"], sharpness: float = 1.0
 ) -> Float[np.ndarray, "corners 3"]:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.deprecation import warn
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
@@ -132,6 +133,7 @@ def check_reduction(function: str, reduce: str) -> str:
     return checks.choice(function, "reduce", reduce, REDUCTIONS)
 
 
+@public
 def save_landscape(path: str | os.PathLike, landscape: Landscape, about: dict | None = None) -> None:
     """Write a landscape to an .npz file: its arrays, and a JSON header that describes them.
 
@@ -165,6 +167,7 @@ def save_landscape(path: str | os.PathLike, landscape: Landscape, about: dict | 
     replace_file("save_landscape", path, lambda file: np.savez(file, header=np.array(text), **arrays))
 
 
+@public
 def load_landscape(path: str | os.PathLike) -> tuple[Landscape, dict]:
     """Read a file of `save_landscape`, also of the release before.
 

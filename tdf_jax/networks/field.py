@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
 from tdf_jax.networks.occupancy import NORM_FLOOR, Conditioned, decode
 
 
@@ -30,6 +31,7 @@ class DescriptorField:
         """The latent z; its vectors rotate with the cloud."""
         return self.conditioned.latent
 
+    @public
     def descriptors(self, x: Float[Array, "*batch 3"]) -> Float[Array, "*batch channels"]:
         """Point descriptors, of unit length.
 
@@ -41,6 +43,7 @@ class DescriptorField:
         # In a trained network |p|^2 and fc_in are never zero at the same point, so the square root is differentiable.
         return descriptor / jnp.maximum(jnp.sqrt(jnp.sum(descriptor**2, axis=-1, keepdims=True)), NORM_FLOOR)
 
+    @public
     def occupancy(self, x: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
         """Probability that points lie inside the object, in [0, 1].
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.errors import InputError
 from tdf_jax.networks.field import DescriptorField
 from tdf_jax.networks.model import Model
@@ -20,6 +21,7 @@ RATE = 0.003
 DECAYS = 0.9, 0.999  # decay rates of Adam's moments
 
 
+@public
 def refine(model: Model, field: DescriptorField, points: Float[Array, "points 3"], steps: int = 40) -> DescriptorField:
     """Fit the shape of a field to the points of its object.
 

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import host
 from tdf_jax._internal.deprecation import renamed_fields
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
@@ -105,6 +106,7 @@ class Cleared:
     status: str
 
 
+@host
 def push_clear(
     trajectory: Trajectory,
     body: Float[Array, "points 3"],

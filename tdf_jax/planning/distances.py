@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import host
 from tdf_jax._internal.deprecation import warn
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
@@ -66,6 +67,7 @@ class Clearance:
         return self.min
 
 
+@host
 def clearance(
     trajectory: Trajectory, body: Float[Array, "points 3"], obstacles: Sequence[Obstacle], *, between: int | None = None
 ) -> Clearance:

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import host
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.distance_fields import DistanceGrid, grid_nodes, tabulated
 from tdf_jax.networks.field import DescriptorField
@@ -17,6 +18,7 @@ FIELD_BLOCK = 8192
 FIELD_REACH = 0.015
 
 
+@host
 def field_obstacle(
     field: DescriptorField, points: Float[Array, "points 3"], pitch: float = 0.003, pad: float = 0.03
 ) -> DistanceGrid:

@@ -16,7 +16,7 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from tdf_jax._internal import checks, devices
-from tdf_jax._internal.boundary import public
+from tdf_jax._internal.boundary import host
 from tdf_jax._internal.deprecation import renamed_fields, renamed_keywords
 from tdf_jax.energy.losses import EnergyWeights, pose_energy, waypoint_loss
 from tdf_jax.energy.reference import Reference
@@ -78,7 +78,7 @@ class OptimizeConfig:
         return self.iterations
 
 
-@public
+@host
 @renamed_keywords(mesh="device_mesh")
 def optimize(
     field: DescriptorField,

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from tdf_jax._internal import checks, devices
-from tdf_jax._internal.boundary import public
+from tdf_jax._internal.boundary import host
 from tdf_jax._internal.deprecation import renamed_fields, renamed_keywords
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import EnergyWeights
@@ -136,7 +136,7 @@ class Candidates(NamedTuple):
     history: Float[np.ndarray, "times rows free"] = np.empty((0, 0, 0))
 
 
-@public
+@host
 @renamed_keywords(mesh="device_mesh")
 def solve(
     field: DescriptorField,

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.errors import InputError
 from tdf_jax.networks.field import DescriptorField
 
@@ -34,6 +35,7 @@ CURVES = {
 }
 
 
+@public
 def confidence(residual: float, intercept: float = INTERCEPT, slope: float = SLOPE) -> float | None:
     """Probability that a pick is within 2 cm and 20 degrees of the ground truth.
 
@@ -163,6 +165,7 @@ def fit(residual: Float[np.ndarray, " picks"], right: Float[np.ndarray, " picks"
     return float(intercept), float(slope)
 
 
+@public
 def surface_logit(field: DescriptorField, points: Float[Array, "points 3"]) -> float:
     """Mean logit of the occupancy at an object's own points, each clipped to [-3, 3].
 
@@ -189,6 +192,7 @@ def _logits(field, x):
     return jnp.clip(jnp.log(occupancy) - jnp.log1p(-occupancy), -MAX_LOGIT, MAX_LOGIT)
 
 
+@public
 def recognition(
     residual: float, surface_logit: float, curve: tuple[float, float, float] = CURVES["mug"]
 ) -> float | None:

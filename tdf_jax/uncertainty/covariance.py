@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.deprecation import renamed_fields
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import waypoint_loss
@@ -36,13 +37,14 @@ FREE = 0.03
 # mug takes three or four passes. A random network, whose sigmas differ by a factor of 100, takes the most.
 MAX_PASSES, CONVERGED = 8, 0.01
 # Radians. Times the rotation_scale, they are the lengths of the first steps and the largest length of a step.
-FIRST_ANGLE, MAX_ANGLE = np.radians(5), np.radians(15)
+FIRST_ANGLE, MAX_ANGLE = float(np.radians(5)), float(np.radians(15))
 MAX_SIGMA = 1.0  # radians; times the rotation_scale, the sigma of a direction without curvature
 # A unit twist is a pure translation if its rotation times the rotation_scale is smaller: its axis is then a thousand
 # rotation scales away.
 PURE_TRANSLATION = 1e-3
 
-_FIRST, _SECOND = np.tril_indices(6, -1)
+# JAX 0.10 mistakes 64-bit indices after `jax_enable_x64` has changed.
+_FIRST, _SECOND = (part.astype(np.int32) for part in np.tril_indices(6, -1))
 _AXES = np.eye(6)
 # Directions of the steps, of length 1, each of which is taken both ways: the six axes, then the sums and the
 # differences of their 15 pairs.
@@ -104,6 +106,7 @@ class PoseCovariance:
     scale: Float[Array, ""]
 
     @property
+    @public
     def free(self) -> Float[np.ndarray, "free 6"]:
         """Twists that the energy does not determine, by rising curvature, (free, 6).
 
@@ -123,6 +126,7 @@ class PoseCovariance:
         return np.asarray(self.directions)[values <= bound]
 
     @property
+    @public
     def screws(self) -> list[Screw]:
         """The free twists as screw motions; an object of revolution has a rotation about its axis, with pitch 0.
 
@@ -135,6 +139,7 @@ class PoseCovariance:
         ]
 
 
+@public
 def pose_covariance(
     field: DescriptorField,
     reference: Reference,

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.errors import InputError
 
 # Radians and metres within which candidates count as one mode. On generated mugs, converged candidates of one pose were
@@ -31,6 +32,7 @@ class Mode:
     share: float
 
 
+@public
 def cluster_poses(
     wxyz_xyz: Float[Array, "candidates 7"],
     energies: Float[Array, " candidates"],
