@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             stream.flush()
         unwritten = lost(streams)
         if unwritten is not None:
-            code = _failed(f"error: {unwritten[0]}", unwritten[1]) if not code else code
+            code = _failed(*unwritten) if not code else code
     if code is not None:
         raise SystemExit(code)
 

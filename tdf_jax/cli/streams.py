@@ -96,14 +96,14 @@ def _open_standard_files() -> None:
 
 
 def lost(streams: tuple[Stream, Stream]) -> tuple[str, int] | None:
-    """What was not written, and the exit code for it; None if everything was.
+    """What was not written, as a message, and the exit code for it; None if everything was.
 
     Args:
         streams: standard output and standard error of `guarded`.
     """
     for stream, name in zip(streams, ("output", "messages")):
+        if stream.error is not None and stream.error.errno == errno.EPIPE:
+            return f"the {name} ended early, because nobody read on", PIPE_CODE
         if stream.error is not None:
-            pipe = stream.error.errno == errno.EPIPE
-            reason = "nobody reads on" if pipe else stream.error.strerror or stream.error
-            return f"the {name} could not be written ({reason})", PIPE_CODE if pipe else CODE
+            return f"error: the {name} could not be written ({stream.error.strerror or stream.error})", CODE
     return None

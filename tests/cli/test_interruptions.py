@@ -106,7 +106,7 @@ def test_an_evaluation_without_its_pictures_is_complete(weights, tmp_path, monke
 @pytest.mark.slow
 def test_a_benchmark_without_its_pictures_is_complete(weights, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("tdf_jax.viz.evaluation.truth_figure", broken)
-    words = ("--pairs", 1, "--methods", "tdf", "--out", tmp_path / "out")
+    words = ("--pairs", 1, "--methods", "centroids", "--out", tmp_path / "out")
     assert run("benchmark", "--weights", weights, *words) == 1
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert {"benchmark.md", "benchmark.json", "errors.png"} <= names and "truth.png" not in names
@@ -178,9 +178,9 @@ def unbuffered():
 
 
 STREAMS = {
-    "full": (full, 1, "the {} could not be written (No space left on device)"),
-    "unbuffered": (unbuffered, 1, "the {} could not be written (No space left on device)"),
-    "unread": (unread, 141, "the {} could not be written (nobody reads on)"),
+    "full": (full, 1, "error: the {} could not be written (No space left on device)"),
+    "unbuffered": (unbuffered, 1, "error: the {} could not be written (No space left on device)"),
+    "unread": (unread, 141, "the {} ended early, because nobody read on"),
 }
 
 
@@ -203,7 +203,7 @@ def test_output_that_cannot_be_written_does_not_end_a_command(command, monkeypat
             assert sys.stdout is stream
         stream.flush()  # as Python does at exit: nothing is left that would fail again
     assert finished == [True]
-    assert capsys.readouterr().err == f"tdf: error: {message.format('output')}\n"
+    assert capsys.readouterr().err == f"tdf: {message.format('output')}\n"
 
 
 @needs_full
@@ -234,7 +234,7 @@ def test_help_that_cannot_be_written(monkeypatch, capsys, kind):
             changed.setattr(sys, "stdout", stream)
             assert run("--help") == code
         stream.flush()
-    assert capsys.readouterr().err == f"tdf: error: {message.format('output')}\n"
+    assert capsys.readouterr().err == f"tdf: {message.format('output')}\n"
 
 
 @needs_full
@@ -393,7 +393,7 @@ def test_a_process_whose_output_is_lost_keeps_its_results(weights, tmp_path, kin
     with make() as stream, tdf_process(*words, stdout=stream, env=environment) as process:
         _, messages = process.communicate()
     assert process.returncode == code and "Traceback" not in messages and "Exception" not in messages
-    assert messages.splitlines()[-1] == f"tdf: error: {message.format('output')}"
+    assert messages.splitlines()[-1] == f"tdf: {message.format('output')}"
     with contextlib.suppress(FileNotFoundError):
         assert len(list((tmp_path / "out").iterdir())) == 5
     assert np.isfinite(tdf.load_trajectory(tmp_path / "out" / "trajectory.npz").wxyz_xyz).all()
