@@ -52,39 +52,33 @@ def read_columns(data: bytes, scale: float = 1.0) -> Float[np.ndarray, "points 3
         rows, names = rows[1:], [header]
         if not rows:
             raise ValueError("it has a line of names, and no numbers")
-    table = [_split(row, delimiter, comma) for _, row in rows]
-    if all(row[-1] == "" for row in table) and len(table[0]) > 1:
-        table = [row[:-1] for row in table]  # a delimiter at the end of each line
-    width = len(table[0])
-    for (number, _), row in zip(rows, table):
-        if row is table[-1] and len(row) < width:
-            raise ValueError(f"it ends within line {number}, which has {len(row)} columns and not {width}")
-        if len(row) != width:
-            raise UnsupportedError(
-                f"has {len(row)} columns in line {number}, and {width} in line {rows[0][0]}; expected one point x y z, "
-                "and the same numbers behind it, in each line"
-            )
-    if comma and any(re.fullmatch(r"[+-]?\d*\.\d+", cell) for row in table for cell in row):
-        raise UnsupportedError(_MIXED)
-    _refuse_molecule(table, rows)
+    values = None if comma else _plain(rows, delimiter)
+    if values is None:
+        table = _table(rows, delimiter, comma)
+        width, row_names = len(table[0]), _are_row_names([row[0] for row in table])
+        _refuse_molecule(table, rows)
+    else:
+        table = []
+        width, row_names = values.shape[1], _count_rows(values[:, 0])
     if header is None and delimiter == "," and width >= 6 and width % 2 == 0:
-        if all(re.fullmatch(r"[+-]?\d+", cell) for row in table for cell in row):
+        if all(re.fullmatch(r"[-+\d,\s]+", row) for _, row in rows):
             raise UnsupportedError(
                 f"has {width} columns of whole numbers between commas, which may be decimal commas; expected decimal "
                 f"points; if they are whole numbers, {_HEADER_FIX.replace('x y z', 'x,y,z,r,g,b')}"
             )
-    columns = _named(names, table, scale, required=header is not None)
+    columns = _named(names, width, row_names, scale, required=header is not None)
     if columns is not None:
-        return _values(table, columns, rows)
+        return _values(table, columns, rows) if values is None else values[:, columns]
     if width < 3:
         raise UnsupportedError(f"has {width} columns; expected x, y and z in each line")
-    values = np.full((len(table), width), np.nan)
-    for column in range(width if width <= MOST_COLUMNS else 0):
-        try:
-            values[:, column] = _values(table, [column], rows)[:, 0]
-        except ValueError:  # behind the coordinates there may be words
-            if column < 3:
-                raise
+    if values is None:
+        values = np.full((len(table), width), np.nan)
+        for column in range(width if width <= MOST_COLUMNS else 0):
+            try:
+                values[:, column] = _values(table, [column], rows)[:, 0]
+            except ValueError:  # behind the coordinates there may be words
+                if column < 3:
+                    raise
     return coordinate_columns(values)
 
 
@@ -205,6 +199,33 @@ def _dialect(rows):
     return ",", False
 
 
+def _plain(rows, delimiter):
+    """All numbers, (rows, columns), of text that has nothing but them; None for other text."""
+    try:
+        return np.loadtxt([row for _, row in rows], delimiter=delimiter, comments=None, ndmin=2)
+    except ValueError:
+        return None
+
+
+def _table(rows, delimiter, comma):
+    """Fields of the lines, the same number in each."""
+    table = [_split(row, delimiter, comma) for _, row in rows]
+    if all(row[-1] == "" for row in table) and len(table[0]) > 1:
+        table = [row[:-1] for row in table]  # a delimiter at the end of each line
+    width = len(table[0])
+    for (number, _), row in zip(rows, table):
+        if row is table[-1] and len(row) < width:
+            raise ValueError(f"it ends within line {number}, which has {len(row)} columns and not {width}")
+        if len(row) != width:
+            raise UnsupportedError(
+                f"has {len(row)} columns in line {number}, and {width} in line {rows[0][0]}; expected one point x y z, "
+                "and the same numbers behind it, in each line"
+            )
+    if comma and any(re.fullmatch(r"[+-]?\d*\.\d+", cell) for row in table for cell in row):
+        raise UnsupportedError(_MIXED)
+    return table
+
+
 def _split(row, delimiter, comma):
     if delimiter is None:
         cells = [cell.rstrip(",") for cell in row.split()] if comma else row.split()
@@ -238,14 +259,13 @@ def _header(rows, delimiter, comma):
     )
 
 
-def _named(candidates, table, scale, required):
+def _named(candidates, width, row_names, scale, required):
     """Indices of the columns that are named x, y and z, None if there are no names."""
     found = [(len(names), named) for names in candidates if (named := named_columns(names))]
-    width = len(table[0])
     fitting = [named for count, named in found if count == width]
     if fitting:
         columns, unit = fitting[-1]
-    elif required and found[0][0] == width - 1 and _are_row_names([row[0] for row in table]):
+    elif required and found[0][0] == width - 1 and row_names:
         columns, unit = found[0][1]  # the column of row names has none, as in R
         columns = [column + 1 for column in columns]
     elif required:

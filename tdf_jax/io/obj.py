@@ -1,5 +1,7 @@
 """Wavefront OBJ: vertices and polygons."""
 
+import re
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -27,17 +29,21 @@ def read_obj(data: bytes) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarr
         ValueError: the file is damaged.
         UnsupportedError: it has surfaces that are not polygons, or weights of vertices.
     """
-    vertex_rows, corner_rows, seen, places, has_lines = [], [], [], [], False
+    # Lines are kept as text and split at once, which is quicker than many short lists.
+    vertex_lines, face_lines, vertex_sizes, sizes, seen, places, has_lines = [], [], [], [], [], [], False
     text = decode(data)
     for number, line in _statements(text):
-        word, *rest = line.split()
+        words = line.split()
+        word, size = words[0], len(words) - 1
         if word == "v":
-            vertex_rows.append(rest)
-            if len(rest) not in {3, 4, 6, 7}:
-                raise ValueError(f"line {number} has a vertex of {len(rest)} numbers")
+            if size not in {3, 4, 6, 7}:
+                raise ValueError(f"line {number} has a vertex of {size} numbers")
+            vertex_lines.append(line)
+            vertex_sizes.append(size)
         elif word in {"f", "fo"}:
-            corner_rows.append([corner.partition("/")[0] for corner in rest] if "/" in line else rest)
-            seen.append(len(vertex_rows))
+            face_lines.append(line)
+            sizes.append(size)
+            seen.append(len(vertex_lines))
             places.append(number)
         elif word == "l":
             has_lines = True
@@ -45,15 +51,18 @@ def read_obj(data: bytes) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarr
             raise UnsupportedError(f"has {_SURFACES[word]} in line {number}; expected polygons only; export it as such")
         elif word[:1].isdigit() or word[:1] in "+-.":
             raise ValueError(f"line {number} begins with the number {word}; expected a keyword such as v or f")
-    if corner_rows and len(corner_rows[-1]) < 3 and not text.endswith("\n"):
-        raise ValueError(f"it ends within a face of {len(corner_rows[-1])} corners")
-    vertices = _vertices(vertex_rows)
-    if not corner_rows:
+    if sizes and sizes[-1] < 3 and not text.endswith("\n"):
+        raise ValueError(f"it ends within a face of {sizes[-1]} corners")
+    vertices = _vertices(vertex_lines, vertex_sizes)
+    if not face_lines:
         if has_lines:
             raise UnsupportedError("has no faces, only lines; expected a surface or a point cloud")
         return vertices, np.zeros((0, 3), dtype=np.int64)
-    sizes = np.array([len(row) for row in corner_rows])
-    corners = indices([corner for row in corner_rows for corner in row])
+    words = re.sub(r"/\S*", "", " ".join(face_lines)).split()
+    corners = indices([word for word in words if word not in {"f", "fo"}])
+    if len(corners) != sum(sizes):
+        raise ValueError("it has a face with a corner that has no vertex")
+    sizes = np.array(sizes)
     number = np.repeat(places, sizes)
     # Indices count from 1; negative ones count back from the last vertex above the line.
     resolved = np.where(corners < 0, np.repeat(seen, sizes) + corners, corners - 1)
@@ -87,14 +96,21 @@ def _statements(text):
         raise ValueError(f"it ends within line {start}, which is continued")
 
 
-def _vertices(rows):
-    if not rows:
+def _vertices(lines, sizes):
+    if not lines:
         return np.zeros((0, 3))
-    if any(len(row) in {4, 7} for row in rows):
-        weights = numbers([row[3] for row in rows if len(row) == 4])
-        if (weights != 1).any():
-            raise UnsupportedError(
-                "has vertices with a fourth number other than 1, which readers take for different things; expected "
-                "x y z, or x y z with a colour; remove the fourth number"
-            )
-    return numbers([value for row in rows for value in row[:3]]).reshape(-1, 3)
+    if len(set(sizes)) == 1:
+        words, step = " ".join(lines).split(), sizes[0] + 1
+        columns = [words[column::step] for column in range(1, step)]
+        weights = columns[3] if step == 5 else []
+    else:
+        rows = [line.split() for line in lines]
+        columns = [[row[column] for row in rows] for column in (1, 2, 3)]
+        weights = [row[4] for row in rows if len(row) == 5]
+    if (numbers(weights) != 1).any():
+        raise UnsupportedError(
+            "has vertices with a fourth number other than 1, which readers take for different things; expected "
+            "x y z, or x y z with a colour; remove the fourth number"
+        )
+    x, y, z = columns[:3]
+    return numbers([*x, *y, *z]).reshape(3, -1).T.copy()

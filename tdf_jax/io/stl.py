@@ -10,9 +10,6 @@ from tdf_jax.io.text import decode, numbers
 
 _HEADER = 84  # bytes: 80 of anything, which may begin with "solid", and the number of triangles
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("vertices", "<f4", (3, 3)), ("attribute", "<u2")])
-_VERTEX = re.compile(r"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)")
-# The name of a solid may be any text, also the word facet. A file may also be written in a single line.
-_NAME = re.compile(r"(?:^|(?<=endfacet))[ \t]*(endsolid|solid)\b(?:(?!\bfacet\s+normal\b).)*", re.MULTILINE)
 
 
 def read_stl(data: bytes) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
@@ -34,7 +31,7 @@ def read_stl(data: bytes) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarr
         return vertices, np.arange(len(vertices)).reshape(-1, 3)
     head = decode(data[:512])
     if re.match(r"\s*solid\b", head, re.IGNORECASE) and "\0" not in head[:_HEADER]:  # a count has a zero byte
-        return _ascii(re.sub(r"\bend[ \t]+(?=(loop|facet|solid)\b)", "end", decode(data).lower()))
+        return _ascii(decode(data).lower())
     if len(data) < _HEADER:
         raise ValueError(f"it has {len(data)} bytes; a binary one has at least {_HEADER}, an ASCII one begins by solid")
     size = _HEADER + count * _TRIANGLE.itemsize
@@ -45,15 +42,51 @@ def read_stl(data: bytes) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarr
 
 
 def _ascii(text):
-    names = [match.group(1) for match in _NAME.finditer(text)]
-    if not names or not names[-1].startswith("end") or 2 * names.count("solid") != len(names):
+    if re.search("end[ \t]", text):
+        text = re.sub(r"\bend[ \t]+(?=(loop|facet|solid)\b)", "end", text)
+    text, names = _without_names(text)
+    if not names or names[-1] != "endsolid" or 2 * names.count("solid") != len(names):
         raise ValueError(f"it is truncated: {names.count('solid')} solids, of which not all have an endsolid")
-    text = _NAME.sub(" ", text)
-    loops = re.split(r"\bendloop\b", text)
-    if len(re.findall(r"\bouter\s+loop\b", text)) != len(loops) - 1 or "vertex" in loops[-1]:
+    *loops, rest = text.split("endloop")
+    if "loop" in rest or "vertex" in rest:
         raise ValueError("it is truncated: not every outer loop has an endloop")
-    found = [_VERTEX.findall(loop) for loop in loops[:-1]]
-    if sum(map(len, found)) != text.count("vertex"):
-        raise ValueError("it has a vertex that is not three numbers")
-    vertices = numbers([number for loop in found for vertex in loop for number in vertex]).reshape(-1, 3)
-    return vertices, triangulate(vertices, np.arange(len(vertices)), np.array([len(loop) for loop in found], np.int64))
+    found = [_corners(loop.split()) for loop in loops]
+    coordinates = [number for corners in found for number in corners]
+    sizes = np.array([len(corners) // 3 for corners in found], dtype=np.int64)
+    vertices = numbers(coordinates).reshape(-1, 3)
+    return vertices, triangulate(vertices, np.arange(len(vertices)), sizes)
+
+
+def _corners(words):
+    """Coordinates of the vertices of a loop, which follow the words outer loop."""
+    first = words.index("vertex") if "vertex" in words else len(words)
+    vertices = words[first:]
+    if (
+        words[first - 2 : first] != ["outer", "loop"]
+        or len(vertices) % 4
+        or vertices[::4].count("vertex") * 4 != len(vertices)
+    ):
+        raise ValueError(
+            "it has a vertex that is not three numbers, or a loop without its words outer loop and endloop"
+        )
+    del vertices[::4]
+    return vertices
+
+
+def _without_names(text):
+    """Text without the lines solid and endsolid, whose names may be any words, and the keywords of these lines."""
+    pieces, keywords, last, position = [], [], 0, 0
+    while (found := text.find("solid", position)) >= 0:
+        start = found - 3 if text.startswith("end", max(found - 3, 0)) else found
+        before = text[text.rfind("\n", 0, start) + 1 : start].strip()
+        position = found + len("solid")
+        if before and not before.endswith("endfacet"):
+            continue
+        stop = text.find("\n", position)
+        stop = len(text) if stop < 0 else stop
+        facet = re.search(r"\bfacet\s+normal\b", text[position:stop])  # a file may be one line
+        position = position + facet.start() if facet else stop
+        pieces.append(text[last:start])
+        keywords.append(text[start : found + len("solid")])
+        last = position
+    return " ".join([*pieces, text[last:]]), keywords

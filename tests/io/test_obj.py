@@ -123,6 +123,8 @@ DAMAGED = {
     V + "f 1 2 0\n": "line 13 has vertex 0; there are 12, counted from 1",
     "v 0 0 0\nf -1 -2 -3\n" + V: "line 2 has vertex -2",
     V + "f 1 2 a\n": "'a' is no number",
+    V + "f 1 /2 3\n": "a face with a corner that has no vertex",
+    V + "f 1 f 3\n": "a face with a corner that has no vertex",
     V + "f 1 2 3.5\n": "'3.5' is no whole number",
     V + "f 1 2 3\nf 4 5": "ends within a face of 2 corners",
     V + "1 2 3\n" + faces(): "line 13 begins with the number 1",
