@@ -13,14 +13,16 @@ from tdf_jax.networks.occupancy import parameter_count
 def convert(
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IN.pth")],
     target: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT.safetensors")],
+    prefix: Annotated[str | None, tyro.conf.arg(help_behavior_hint="(default: the only one)")] = None,
 ) -> None:
     """Convert a published Neural Descriptor Fields checkpoint; nothing in it is executed.
 
     Args:
-        source: PyTorch file, `.pth`.
+        source: PyTorch file, such as `.pth` or `.ckpt`, or safetensors with PyTorch's names.
         target: file to write, `.safetensors`.
+        prefix: prefix of the network's names, such as ema.module; for files with several networks.
     """
-    model = convert_checkpoint(source)
+    model = convert_checkpoint(source, prefix=prefix)
     save_model(model, target)
     print(f"parameters   {parameter_count(model.config):,}")
     print(f"latent size  {model.config.latent}")

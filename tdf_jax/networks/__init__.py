@@ -9,6 +9,7 @@ Modules:
     occupancy: the network: encoder, decoder, configuration
     refinement: a field's shape fitted to its points
     surface: the surface of occupancy 1/2 as triangles
+    tensor_file: tensors in a file of PyTorch or safetensors, by name
     torch_pickle: the pickle in a PyTorch file, read without being executed
     vector_neurons: rotation-equivariant layers
 """

@@ -1,77 +1,91 @@
 """Conversion of published Neural Descriptor Fields checkpoints (PyTorch `.pth`) to a `Model`, without torch.
 
-Nothing in the file is executed. `torch_pickle` interprets the descriptions of its tensors; this module compares them
-with the network, reads their bytes and renames them.
+Nothing in the file is executed. `tensor_file` lists the tensors in it; this module finds those of the network under
+whatever prefix they have, compares them with the network, reads and renames them.
 """
 
-import contextlib
+import collections
 import dataclasses
 import os
 import statistics
-import struct
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
 import jax.numpy as jnp
-import numpy as np
 from flax.traverse_util import unflatten_dict
 
 from tdf_jax._internal.boundary import public
 from tdf_jax._internal.errors import InputError
 from tdf_jax.networks.model import NDF_SIZES, Model, ModelInfo, shape_problems, value_problems
 from tdf_jax.networks.occupancy import NetworkConfig, parameter_shapes
-from tdf_jax.networks.torch_pickle import STORAGE_LIMIT, Refusal, Tensor, interpret
+from tdf_jax.networks.tensor_file import SAVE, Entry, TensorFile, is_shard, opened
+from tdf_jax.networks.torch_pickle import Refusal
 
-PICKLE_LIMIT = 2**20  # bytes; that of the published network has 10 kB
-WRAPPERS = ("state_dict", "model_state_dict", "model")  # keys under which training scripts save the network
-RESAVE = 'if you trust it, re-save it with PyTorch: torch.save(torch.load(p, map_location="cpu"), new)'
+PARTS = ("encoder.", "decoder.")
+MOST_NAMED = 5  # prefixes and unknown names in a message
 
 
 @public
-def convert_checkpoint(path: str | os.PathLike, name: str | None = None) -> Model:
+def convert_checkpoint(path: str | os.PathLike, name: str | None = None, prefix: str | None = None) -> Model:
     """Convert a PyTorch checkpoint of the published layout (`ndf_robot`'s `VNNOccNet`); the latent size is inferred.
 
+    The network may be anywhere in the file, such as under the key `state_dict` of a training framework, and its names
+    may have any prefix, such as `module.`, `model.` and `_orig_mod.` of wrappers. Tensors under other prefixes, such as
+    those of an optimiser or of another network, and other content are ignored.
+
     Args:
-        path: `.pth` file that `torch.save` wrote (a zip, as since PyTorch 1.6). It holds a state_dict, bare or under
-            one of the keys state_dict, model_state_dict or model, with or without a `module.` prefix on every name.
-            Half and double precision are cast to float32.
+        path: `.pth`, `.pt` or `.ckpt` file that `torch.save` wrote (a zip, as since PyTorch 1.6), or a `.safetensors`
+            file with PyTorch's names. Half and double precision are cast to float32.
         name: name of the model; by default that of the file.
+        prefix: prefix of the network's names, such as "ema.module."; keys of nested dictionaries are a part of it. It
+            is needed if the file holds several such networks.
 
     Returns:
         The model. Its kernels are (in, out), transposed from PyTorch's (out, in).
 
     Raises:
-        InputError: the file is of another kind or damaged, its pickle names anything but tensors, or it is of another
-            architecture.
+        InputError: the file is of another kind or damaged, holds no such network or several, or the network is of
+            another architecture.
     """
     path = Path(path)
     try:
-        with _open(path) as archive:
-            config, params = _convert(archive)
+        with opened(path) as file:
+            config, params = _convert(file, prefix)
     except Refusal as reason:
-        raise InputError(f"convert_checkpoint(): refused to load {path}: {reason}") from None
+        shard = "; it is one of several files of a checkpoint: load them in PyTorch, and " + SAVE
+        raise InputError(
+            f"convert_checkpoint(): refused to load {path}: {reason}{shard if is_shard(path) else ''}"
+        ) from None
     source = f"converted from the PyTorch checkpoint {path.name}"
     smallest, largest = NDF_SIZES
     info = ModelInfo(path.stem if name is None else name, source, smallest_diagonal=smallest, largest_diagonal=largest)
     return Model(params, config, info)
 
 
-def _convert(archive: zipfile.ZipFile) -> tuple[NetworkConfig, dict]:
-    pickles = [member for member in archive.namelist() if member.count("/") == 1 and member.endswith("/data.pkl")]
-    if len(pickles) != 1:
-        raise Refusal(f"expected one data.pkl in its zip archive, found {len(pickles)}: not a file from torch.save")
-    root = pickles[0].removesuffix("data.pkl")
-    state = _state_dict(interpret(_member(archive, pickles[0], PICKLE_LIMIT)))
-    shapes = {name: tensor.shape for name, tensor in state.items()}
+def _convert(file: TensorFile, prefix: str | None) -> tuple[NetworkConfig, dict]:
+    prefix = _prefix(file, prefix)
+    state = _network(file.entries, prefix)
+    shapes = {name: entry.shape for name, entry in state.items()}
     config = _infer_config(shapes)
     expected = {name.replace(".kernel", ".weight"): shape[::-1] for name, shape in parameter_shapes(config).items()}
+    for name, entry in state.items():
+        if name in expected and entry.problem:
+            raise Refusal(f"its tensor {prefix}{name} {entry.problem}")
     problems = shape_problems(shapes, expected)
     if problems:
-        raise Refusal(f"it is not an NDF occupancy network with latent size {config.latent}: {problems}")
+        where = f" under the prefix {prefix!r}" if prefix else ""
+        extra = "; save the tensors of encoder and decoder alone" if set(shapes) > set(expected) else ""
+        raise Refusal(
+            f"it is not an NDF occupancy network with latent size {config.latent}{where}: {problems}{extra}"
+            f"{_unknown(file)}"
+        )
 
-    order = _byte_order(archive, root)
-    tensors = {name: _read(archive, root, name, tensor, order) for name, tensor in state.items()}
+    tensors = {}
+    for name, entry in state.items():
+        try:
+            tensors[name] = entry.read()
+        except Refusal as reason:
+            raise Refusal(f"its tensor {prefix}{name} {reason}") from None
     problems = value_problems(tensors)
     if problems:
         raise Refusal(f"NaN, infinite or too large for float32: {problems}")
@@ -79,21 +93,68 @@ def _convert(archive: zipfile.ZipFile) -> tuple[NetworkConfig, dict]:
     return config, unflatten_dict(params, sep=".")
 
 
-def _state_dict(tree: object) -> dict[str, Tensor]:
-    inner = [tree[key] for key in WRAPPERS if isinstance(tree, dict) and isinstance(tree.get(key), dict)]
-    state = inner[0] if inner else tree
-    if not isinstance(state, dict) or not state:
-        raise Refusal(f"it holds a {type(state).__name__}, expected a state_dict; save model.state_dict() instead")
-    strangers = [
-        f"{name} ({type(value).__name__})"
-        for name, value in state.items()
-        if not (isinstance(name, str) and isinstance(value, Tensor))
-    ]
-    if strangers:
-        raise Refusal(f"expected a state_dict of tensors, got {', '.join(strangers)}; save model.state_dict() instead")
-    if all(name.startswith("module.") for name in state):
-        state = {name.removeprefix("module."): tensor for name, tensor in state.items()}
-    return state
+def _prefix(file: TensorFile, wanted: str | None) -> str:
+    """Prefix of the network's names: the one under which all of its tensors are, or else most of them."""
+    names = {name.replace(".kernel", ".weight") for name in parameter_shapes(NetworkConfig())}
+    found: dict[str, list[str]] = collections.defaultdict(list)
+    longest = max(name.count(".") for name in names)
+    for entry in file.entries:
+        parts = entry.rsplit(".", longest + 1)
+        for begin in range(len(parts)):
+            inner = ".".join(parts[begin:])
+            if inner in names:
+                found[entry.removesuffix(inner)].append(inner)
+    if not found:
+        raise Refusal(_nothing(file))
+    if wanted is not None:
+        wanted = wanted + "." if wanted and not wanted.endswith(".") else wanted
+        if wanted not in found:
+            raise Refusal(f"none of the network's tensors has the prefix {wanted!r}; expected one of {_listed(found)}")
+        return wanted
+    most = max(map(len, found.values()))
+    several: dict[tuple, str] = {}
+    for prefix, inner in found.items():
+        if len(inner) == most:  # one network that is saved under two names counts once
+            several.setdefault(tuple(file.entries[prefix + name].source for name in sorted(inner)), prefix)
+    if len(several) > 1 and most == len(names):
+        raise Refusal(
+            f"it holds {len(several)} NDF occupancy networks, under the prefixes {_listed(several.values())}; expected "
+            "one. Choose it with prefix=, or --prefix of tdf convert"
+        )
+    return next(iter(several.values()))
+
+
+def _network(entries: Mapping[str, Entry], prefix: str) -> dict[str, Entry]:
+    """Tensors of encoder and decoder under a prefix, and others beside these in the same dictionary."""
+    own = {name.removeprefix(prefix): entry for name, entry in entries.items() if name.startswith(prefix)}
+    containers = {entry.container for name, entry in own.items() if name.startswith(PARTS)}
+    return {name: entry for name, entry in own.items() if name.startswith(PARTS) or entry.container in containers}
+
+
+def _nothing(file: TensorFile) -> str:
+    """What a file without any tensor of the network holds, and what to do."""
+    if not file.entries:
+        holds = ", ".join(file.others[:MOST_NAMED]) or "nothing"
+        return f"expected a state_dict of tensors, got {holds}{_unknown(file)}; {SAVE}"
+    prefixes = {name[: name.rfind(".") + 1] for name in file.entries}
+    tops = sorted({".".join(prefix.split(".")[:2]) for prefix in prefixes})
+    return (
+        f"none of its {len(file.entries)} tensors is one of an NDF occupancy network, such as "
+        f"encoder.conv_pos.map_to_feat.weight under any prefix; it has tensors under {_listed(tops)}{_unknown(file)}; "
+        f"{SAVE}"
+    )
+
+
+def _unknown(file: TensorFile) -> str:
+    if not file.unknown:
+        return ""
+    names = ", ".join(file.unknown[:MOST_NAMED]) + (", ..." if len(file.unknown) > MOST_NAMED else "")
+    return f"; it references {names}, which no tensor needs and nothing executes"
+
+
+def _listed(prefixes) -> str:
+    names = [repr(prefix) for prefix in prefixes]
+    return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else "")
 
 
 def _infer_config(shapes: Mapping[str, tuple[int, ...]]) -> NetworkConfig:
@@ -113,70 +174,3 @@ def _infer_config(shapes: Mapping[str, tuple[int, ...]]) -> NetworkConfig:
     ]
     latent = max(statistics.mode(latents or [default.latent]), 1)
     return dataclasses.replace(default, latent=latent, decoder_width=statistics.mode(widths or [default.decoder_width]))
-
-
-@contextlib.contextmanager
-def _zip_errors():
-    try:
-        yield
-    except (zipfile.BadZipFile, EOFError, RuntimeError, ValueError, OverflowError, struct.error) as error:
-        raise Refusal(f"its zip archive is truncated or damaged ({error}); copy or download it again") from None
-    except OSError as error:
-        raise Refusal(f"cannot read it ({error}); check the path and its permissions") from None
-
-
-def _open(path: Path) -> zipfile.ZipFile:
-    if not path.is_file():
-        raise Refusal("there is no such file; check the path")
-    with _zip_errors():
-        with path.open("rb") as file:
-            start = file.read(512)
-        if start.startswith(b"PK\x03\x04"):
-            return zipfile.ZipFile(path)
-    # Files from before PyTorch 1.6 are consecutive pickles, which begin with the byte of their protocol; older ones are
-    # tar archives.
-    if start.startswith(b"\x80") or start[257:262] == b"ustar":
-        raise Refusal(f"it is a pickle or PyTorch's old format, not a zip archive; {RESAVE}")
-    raise Refusal("it is not a PyTorch checkpoint: it does not begin as a zip archive; expected a file from torch.save")
-
-
-def _member(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
-    with _zip_errors():
-        try:
-            info = archive.getinfo(name)
-        except KeyError:
-            raise Refusal(f"{name} is missing from its zip archive; copy or download it again") from None
-        # torch.save never compresses. A stored member cannot be larger than the file, which excludes zip bombs.
-        if info.compress_type != zipfile.ZIP_STORED or info.compress_size != info.file_size:
-            raise Refusal(f"{name} is compressed, which torch.save never does; {RESAVE}")
-        if info.file_size > limit:
-            raise Refusal(f"{name} has {info.file_size} bytes; expected at most {limit}")
-        return archive.read(info)
-
-
-def _byte_order(archive: zipfile.ZipFile, root: str) -> str:
-    """Numpy's sign for the byte order of the storages; older files do not state it and are little-endian."""
-    if root + "byteorder" not in archive.namelist():
-        return "<"
-    order = _member(archive, root + "byteorder", limit=16)
-    if order not in (b"little", b"big"):
-        raise Refusal(f"its byte order is {order!r}; expected little or big")
-    return "<" if order == b"little" else ">"
-
-
-def _read(archive: zipfile.ZipFile, root: str, name: str, tensor: Tensor, order: str) -> np.ndarray:
-    """Values of a tensor in float32."""
-    storage = tensor.storage
-    dtype = jnp.dtype(storage.dtype)
-    if not jnp.issubdtype(dtype, jnp.floating):
-        raise Refusal(f"{name} holds {dtype} numbers; expected floating point")
-    raw = _member(archive, f"{root}data/{storage.key}", STORAGE_LIMIT)
-    if len(raw) != storage.count * dtype.itemsize:
-        raise Refusal(f"{name} has {len(raw)} bytes; expected {storage.count} {dtype} numbers; copy the file again")
-    # The bytes are read as unsigned integers because numpy cannot swap those of bfloat16.
-    words = np.frombuffer(raw, f"{order}u{dtype.itemsize}")
-    numbers = words.astype(f"=u{dtype.itemsize}").view(dtype)[tensor.offset :]
-    strides = [stride * dtype.itemsize for stride in tensor.strides]
-    view = np.lib.stride_tricks.as_strided(numbers, tensor.shape, strides)
-    with np.errstate(over="ignore"):  # the caller reports float64 values that become infinite
-        return view.astype(np.float32)

@@ -1,5 +1,6 @@
 """Checkpoint files are put together here by hand, instruction by instruction: torch would not write most of them."""
 
+import gzip
 import io
 import math
 import os
@@ -7,17 +8,20 @@ import pickle
 import re
 import struct
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import safetensors.numpy
 from flax.traverse_util import flatten_dict
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.cli.convert import convert
-from tdf_jax.networks.checkpoint import load_model
+from tdf_jax.networks import tensor_file
+from tdf_jax.networks.checkpoint import load_model, save_model
 from tdf_jax.networks.ndf_checkpoint import convert_checkpoint
 from tdf_jax.networks.occupancy import NetworkConfig, parameter_shapes
 from tdf_jax.networks.torch_pickle import Refusal, interpret
@@ -206,6 +210,216 @@ def test_command_writes_a_file_that_loads(tmp_path, capsys):
     assert (loaded.config, loaded.info) == (converted.config, converted.info)
 
 
+# --- where the network is in the file ---
+
+
+def parts_of(weights, prefix="", first=0):
+    """Pickled tensors by name, whose storages are numbered from `first`."""
+    numbered = enumerate(weights.items(), first)
+    return {prefix + name: tensor(storage(str(key), array.size), array.shape) for key, (name, array) in numbered}
+
+
+def storages_of(weights, first=0):
+    return {str(key): array.tobytes() for key, array in enumerate(weights.values(), first)}
+
+
+def plain(items):
+    """A dictionary of Python, not an OrderedDict."""
+    return dictionary(items, kind=b"}")
+
+
+def instance(module, name, state):
+    """An object of a class, with its attributes."""
+    return named(module, name) + b")\x81" + plain(state) + b"b"
+
+
+SCALAR = called(named("numpy._core.multiarray", "scalar"), called(named("numpy", "dtype"), text("f8")), b"C\x02ab")
+SPARSE = called(named("torch._utils", "_rebuild_sparse_tensor"), text("x"))
+# Tensors that could not be read, but belong to another part.
+OTHERS = {
+    "loss.weight": tensor(storage("none", 4), (2, 2)),
+    "loss.empty": tensor(storage("none", 0), (0,)),
+    "second.layers": tensor(storage("none", 2**40), (2**20, 2**20)),
+    "second.phase": tensor(storage("none", 2, kind="ComplexFloatStorage"), (2,)),
+    "second.edges": SPARSE,
+}
+HYPERPARAMETERS = {
+    "config": instance("omegaconf", "DictConfig", {"_content": plain({"lr": b"G" + struct.pack(">d", 0.1)})}),
+    "folder": called(named("pathlib", "PosixPath"), text("/"), text("data")),
+    "sizes": b"\x8f(" + integer(1) + integer(2) + b"\x90",
+    "best": SCALAR,
+    "device": called(named("torch", "device"), text("cuda"), integer(0)),
+    "dtype": named("torch", "float32"),
+    "many": integer(10**18),
+    "table": b"}(" + sequence(integer(1), integer(2)) + integer(3) + b"N" + integer(4) + b"u",
+    "queue": called(named("collections", "deque")) + b"(" + integer(1) + integer(2) + b"e",
+}
+
+
+@pytest.mark.parametrize("beside", [{}, OTHERS], ids=["alone", "beside others"])
+@pytest.mark.parametrize(
+    "prefix", ["module.", "_orig_mod.", "model.", "net.", "module._orig_mod.", "_orig_mod.module.", "a.b.c.d.e."]
+)
+def test_one_prefix_of_any_kind(tmp_path, weights, prefix, beside):
+    path = write_zip(tmp_path / "a.pth", pickled(dictionary(parts_of(weights, prefix) | beside)), storages_of(weights))
+    assert_holds(convert_checkpoint(path), weights)
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda state: plain({"net": dictionary(state), "epoch": integer(7), "best": SCALAR}),
+        lambda state: plain({"optimizer": plain({"state": plain(OTHERS)}), "ema": plain({"model": dictionary(state)})}),
+        lambda state: b"](" + dictionary(state) + integer(3) + b"e",
+        lambda state: called(named("my.utils", "AttrDict")) + b"(" + text("model") + dictionary(state) + b"u",
+        lambda state: plain({"old": b"}" + b"q\x07" + b"(" + b"u", "model": b"h\x07", "x": dictionary(state)}),
+    ],
+    ids=["key", "nested", "list", "object", "memo"],
+)
+def test_containers_of_a_state_dict(tmp_path, weights, wrap):
+    path = write_zip(tmp_path / "a.pth", pickled(wrap(parts_of(weights))), storages_of(weights))
+    assert_holds(convert_checkpoint(path), weights)
+
+
+def test_checkpoint_of_a_training_framework(tmp_path, weights):
+    """The layout of Lightning's, with hyperparameters of unknown classes, which are not imported."""
+    content = {
+        "epoch": integer(3),
+        "pytorch-lightning_version": text("2.2.1"),
+        "state_dict": dictionary(parts_of(weights, "model.") | OTHERS),
+        "callbacks": plain({"EarlyStopping{}": plain({"best_score": OTHERS["loss.weight"]})}),
+        "optimizer_states": b"](" + plain({"state": b"}" + integer(0) + plain(OTHERS) + b"s"}) + b"e",
+        "hyper_parameters": instance("lightning.pytorch.utilities.parsing", "AttributeDict", HYPERPARAMETERS),
+    }
+    before = set(sys.modules)
+    path = write_zip(tmp_path / "a.ckpt", pickled(plain(content)), storages_of(weights))
+    assert_holds(convert_checkpoint(path), weights)
+    assert not {"torch", "omegaconf", "lightning"} & (set(sys.modules) - before)
+
+
+def test_a_whole_module(tmp_path, weights):
+    """As `torch.save(model)` writes it: nested objects with their parameters."""
+
+    def module(state):
+        own = {name: value for name, value in state.items() if "." not in name}
+        children = {name.split(".")[0] for name in state if "." in name}
+        parts = {
+            child: module({key.split(".", 1)[1]: value for key, value in state.items() if key.startswith(child + ".")})
+            for child in sorted(children)
+        }
+        return instance(
+            "ndf_robot.model",
+            "VNNOccNet",
+            {"training": b"\x88", "_parameters": plain(own), "_modules": plain(parts), "_buffers": plain({})},
+        )
+
+    content = pickled(plain({"model": module(parts_of(weights)), "epoch": integer(1)}))
+    assert_holds(convert_checkpoint(write_zip(tmp_path / "a.pth", content, storages_of(weights))), weights)
+
+
+def test_parameters_of_other_kinds(tmp_path, weights):
+    """Parameters with attributes, subclasses of tensors, and a tensor without hooks."""
+    constructors = [
+        lambda value: called(named("torch._utils", "_rebuild_parameter_with_state"), value, b"\x88", b"}", b"}"),
+        lambda value: called(
+            named("torch._tensor", "_rebuild_from_type_v2"),
+            named("torch._utils", "_rebuild_parameter"),
+            named("my", "Tensor"),
+            sequence(value, b"\x88", b"}"),
+            b"}",
+        ),
+        lambda value: value.replace(b"_rebuild_tensor_v2", b"_rebuild_tensor"),
+    ]
+    parts = {name: constructors[index % 3](value) for index, (name, value) in enumerate(parts_of(weights).items())}
+    path = write_zip(tmp_path / "a.pth", pickled(dictionary(parts)), storages_of(weights))
+    assert_holds(convert_checkpoint(path), weights)
+
+
+def test_several_networks_are_named_and_chosen_by_prefix(tmp_path, weights, capsys):
+    average, count = {name: array + 1 for name, array in weights.items()}, len(weights)
+    content = plain({"model": dictionary(parts_of(weights)), "ema": dictionary(parts_of(average, "module.", count))})
+    path = write_zip(tmp_path / "a.pth", pickled(content), storages_of(weights) | storages_of(average, count))
+    message = refusal(path)
+    assert "2 NDF occupancy networks, under the prefixes 'model.', 'ema.module.'" in message
+    assert "prefix=, or --prefix" in message
+    assert_holds(convert_checkpoint(path, prefix="model"), weights)
+    assert_holds(convert_checkpoint(path, prefix="ema.module."), average)
+    convert(path, tmp_path / "a.safetensors", prefix="ema.module")
+    assert_holds(load_model(tmp_path / "a.safetensors"), average)
+    with pytest.raises(InputError, match=r"none .* has the prefix 'ema\.'; expected one of 'model\.', 'ema\.module\.'"):
+        convert_checkpoint(path, prefix="ema")
+
+
+def test_one_network_under_two_names_counts_once(tmp_path, weights):
+    content = plain({"model": dictionary(parts_of(weights)), "net": dictionary(parts_of(weights, "module."))})
+    assert_holds(convert_checkpoint(write_zip(tmp_path / "a.pth", pickled(content), storages_of(weights))), weights)
+
+
+def test_tensors_beside_encoder_and_decoder_are_not_ignored(tmp_path, weights):
+    """They may be a part of another architecture."""
+    for prefix in ("", "model."):
+        parts = parts_of(weights, prefix) | {prefix + "head.weight": tensor(storage("0", 4), (2, 2))}
+        message = refusal(write_zip(tmp_path / "a.pth", pickled(dictionary(parts)), storages_of(weights)))
+        assert "1 not expected: head.weight (2, 2); save the tensors of encoder and decoder alone" in message
+        assert not prefix or "under the prefix 'model.'" in message
+
+
+def test_tensors_of_another_network_are_named_by_their_prefixes(tmp_path):
+    content = plain({"state_dict": plain({f"backbone.layer{index}.w": OTHERS["loss.weight"] for index in range(9)})})
+    message = refusal(write_zip(tmp_path / "a.pth", pickled(content)))
+    assert "none of its 9 tensors" in message and "under 'state_dict.backbone'; save" in message
+
+
+def test_tensors_of_the_network_that_cannot_be_read_are_named(tmp_path, weights):
+    for value, reason in (
+        (OTHERS["second.phase"], "holds numbers of the kind torch.ComplexFloatStorage"),
+        (OTHERS["loss.empty"], "does not lie in its storage"),
+        (SPARSE, "1 missing: decoder.fc_out.bias (1,); it references torch._utils._rebuild_sparse_tensor,"),
+    ):
+        parts = parts_of(weights, "model.") | {"model.decoder.fc_out.bias": value}
+        message = refusal(write_zip(tmp_path / "a.pth", pickled(dictionary(parts)), storages_of(weights)))
+        assert reason in message and ("model.decoder.fc_out.bias" in message or value == SPARSE)
+
+
+def test_hostile_names_do_not_fill_the_memory():
+    """Deep and long names, and one dictionary that is held many times, end at once."""
+    deep = b"}" + b"".join(text("a") + b"}" for _ in range(50_000)) + b"s" * 50_000
+    key = b"X" + struct.pack("<I", 500_000) + b"a" * 500_000
+    long = b"}(" + key + b"}(" + b"".join(text(str(i)) + b"}" for i in range(20_000)) + b"uu"
+    doubled = b"}q\x00" + b"".join(
+        b"}(" + text("a") + b"h" + bytes([i]) + text("b") + b"h" + bytes([i]) + b"uq" + bytes([i + 1])
+        for i in range(60)
+    )
+    dotted = b"}" + text("." * 100_000) + b"N" + b"s"
+    number = b"}\x8b" + struct.pack("<i", 5000) + b"\x7f" * 5000 + b"Ns"
+    for body in (deep, long, doubled, dotted, number):
+        file = tensor_file._tensors(interpret(pickled(body)).tree)
+        assert file[0] == {} and len("".join(file[1])) < 1000
+
+
+# --- safetensors ---
+
+
+def test_safetensors_with_the_names_of_pytorch(tmp_path, weights):
+    path = tmp_path / "a.safetensors"
+    safetensors.numpy.save_file({f"model.{name}": array for name, array in weights.items()}, path)
+    assert_holds(convert_checkpoint(path), weights)
+    for dtype, tolerance in (("float16", 1e-3), (jnp.bfloat16, 1e-2), ("float64", 0.0)):
+        large = {name: np.sign(array) * (np.abs(array) + 0.01) for name, array in weights.items()}
+        safetensors.numpy.save_file({name: array.astype(dtype) for name, array in large.items()}, path)
+        assert_holds(convert_checkpoint(path), large, tolerance)
+    safetensors.numpy.save_file({name: array.astype("int8") for name, array in weights.items()}, path)
+    assert "holds I8 numbers" in refusal(path)
+    content = path.read_bytes()
+    path.write_bytes(content[:-1])
+    assert "truncated" in refusal(path)
+
+
+def test_weights_of_tdf_jax_need_no_conversion(tmp_path, small_model):
+    save_model(small_model, tmp_path / "a.safetensors")
+    assert "holds weights of tdf_jax already" in refusal(tmp_path / "a.safetensors")
+
+
 # --- files that try to run code ---
 
 
@@ -251,9 +465,10 @@ def test_code_is_refused_by_name_and_not_run(tmp_path, function, protocol):
         (called(named("torch", "load"), text("file")), "references torch.load"),
         (called(named("ndf_robot.model", "VNNOccNet")), "references ndf_robot.model.VNNOccNet"),
         (b"\x8c\x0bcollections\x8c\x14OrderedDict.fromkeys\x93", "references collections.OrderedDict.fromkeys"),
-        (b"(" + text("true") + b"ios\nsystem\n", "references INST os.system"),
-        (named("collections", "OrderedDict") + b")\x81", "references NEWOBJ"),
-        (b"(" + named("collections", "OrderedDict") + b"o", "references OBJ"),
+        (b"(" + text("true") + b"ios\nsystem\n", "references os.system"),
+        (named("os", "system") + b")\x81", "references os.system"),
+        (b"(" + named("os", "system") + b"o", "references os.system"),
+        (called(called(named("builtins", "getattr"), named("os", "system")), text("true")), "getattr, os.system"),
         (b"\x82\x01", "references EXT1"),
         # Allowed things put to other uses: attributes set on a class, a storage called, a string for a function.
         (named("collections", "OrderedDict") + b"}" + text("keys") + integer(1) + b"sb", "damaged"),
@@ -262,7 +477,7 @@ def test_code_is_refused_by_name_and_not_run(tmp_path, function, protocol):
         (called(named("collections", "OrderedDict"), text("abc")), "damaged"),
         (called(text("os.system"), text("true")), "damaged"),
         (called(named("torch._utils", "_rebuild_parameter"), text("abc")), "damaged"),
-        (b"}" + sequence(text("a")) + integer(1) + b"s", "tuple as a key"),
+        (b"}" + sequence(text("a")) + integer(1) + b"s", "expected a state_dict of tensors, got nothing"),
     ],
 )
 def test_anything_but_tensors_is_refused(tmp_path, body, reason):
@@ -271,9 +486,12 @@ def test_anything_but_tensors_is_refused(tmp_path, body, reason):
     assert not {"torch", "ndf_robot"} & (set(sys.modules) - before)
 
 
-def test_whole_model_and_foreign_content_say_what_to_save(tmp_path):
-    assert "state_dict" in refusal(write_zip(tmp_path / "a.pth", pickled(text("hello"))))
+def test_content_without_tensors_says_what_to_save(tmp_path):
+    assert "got str; save" in refusal(write_zip(tmp_path / "a.pth", pickled(text("hello"))))
     assert "epoch (int)" in refusal(write_zip(tmp_path / "a.pth", pickled(dictionary({"epoch": integer(3)}))))
+    array = called(named("numpy._core.multiarray", "_reconstruct"), text("x"))
+    message = refusal(write_zip(tmp_path / "a.pth", pickled(dictionary({"decoder.fc_in.weight": array}))))
+    assert "got decoder.fc_in.weight (numpy._core.multiarray._reconstruct)" in message
 
 
 # --- tensors that claim too much ---
@@ -441,10 +659,52 @@ def test_old_formats_say_how_to_save_again(tmp_path):
     assert advice in refusal(path)
 
 
-@pytest.mark.parametrize("content", [b"", b"hello", b"\x93NUMPY", bytes(1000)])
-def test_not_a_checkpoint(tmp_path, content):
+@pytest.mark.parametrize(
+    ("content", "advice"),
+    [
+        (b"", "expected a file from torch.save"),
+        (b"hello", "expected a file from torch.save"),
+        (bytes(1000), "expected a file from torch.save"),
+        (b"\x93NUMPY", "a NumPy array"),
+        (gzip.compress(b"x"), "compressed by gzip; unpack it"),
+        (b"\n<!DOCTYPE html>", "a web page"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "run git lfs pull"),
+        (b'{"weight_map": {}}', "the index of a checkpoint in several files"),
+        (b"\x89HDF\r\n", "it is HDF5"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else None,
+)
+def test_not_a_checkpoint(tmp_path, content, advice):
     (tmp_path / "a.pth").write_bytes(content)
-    assert "not a PyTorch checkpoint" in refusal(tmp_path / "a.pth")
+    message = refusal(tmp_path / "a.pth")
+    assert "not a PyTorch checkpoint" in message and advice in message
+
+
+def test_archives_around_a_checkpoint_and_other_archives(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.writestr("weights/ndf.pth", b"")
+    assert "a zip archive with weights/ndf.pth in it; unpack it" in refusal(tmp_path / "a.zip")
+    (tmp_path / "ndf.pth").write_bytes(b"x")
+    with tarfile.open(tmp_path / "a.tar", "w") as archive:
+        archive.add(tmp_path / "ndf.pth", "ndf.pth")
+    assert "a tar archive with ndf.pth in it; unpack it" in refusal(tmp_path / "a.tar")
+    np.savez(tmp_path / "a.npz", x=np.zeros(3))
+    assert "a NumPy archive" in refusal(tmp_path / "a.npz")
+    with zipfile.ZipFile(tmp_path / "a.pt2", "w") as archive:
+        archive.writestr("export/archive_format", b"pt2")
+        archive.writestr("export/data/sample.pt", b"")
+    assert "torch.export" in refusal(tmp_path / "a.pt2")
+
+
+def test_folders_and_shards(tmp_path, weights):
+    assert "it is a folder, so there is no such file; expected a file from torch.save" in refusal(tmp_path)
+    (tmp_path / "ndf.pth").touch()
+    assert "one of those in it: ndf.pth" in refusal(tmp_path)
+    (tmp_path / "__0_0.distcp").touch()
+    assert f"dcp_to_torch {tmp_path} new.pth" in refusal(tmp_path)
+    half = dict(list(weights.items())[::2])
+    message = refusal(write_checkpoint(tmp_path / "pytorch_model-00001-of-00002.bin", half))
+    assert f"{len(weights) - len(half)} missing" in message and "one of several files of a checkpoint" in message
 
 
 def test_unknown_byte_order(tmp_path, weights):
@@ -452,9 +712,8 @@ def test_unknown_byte_order(tmp_path, weights):
     assert "expected little or big" in refusal(path)
 
 
-def test_missing_file_directory_and_other_zip(tmp_path):
+def test_missing_file_and_other_zip(tmp_path):
     assert "no such file" in refusal(tmp_path / "nowhere.pth")
-    assert "no such file" in refusal(tmp_path)
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
         archive.writestr("readme.txt", "hello")
     assert "found 0" in refusal(tmp_path / "a.zip")
