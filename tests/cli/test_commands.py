@@ -347,8 +347,8 @@ BAD_CLOUDS = {
     "infinite": (np.where(np.arange(90).reshape(30, 3) == 4, np.inf, cloud(30)), "infinite"),
     "equal": (np.ones((30, 3)), "all equal"),
     "flat": (np.ones((30, 2)), r"shape \(30, 2\)"),
-    "words": (np.array(["a"] * 30), "dtype"),
-    "objects": (np.array([{}] * 30, dtype=object), "cannot be read"),
+    "words": (np.array(["a"] * 30), "type"),
+    "objects": (np.array([{}] * 30, dtype=object), "cannot be read|holds Python objects"),
 }
 
 
@@ -371,11 +371,11 @@ def test_bad_clouds(refusal, weights, tmp_path, name, option):
 
 BAD_FILES = {
     "missing.obj": (None, "there is no file .*missing.obj"),
-    "mug.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "mesh without faces"),
-    "empty.stl": (b"", "mesh without faces"),
+    "mug.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "3 points; expected at least 21"),
+    "empty.stl": (b"", "it is empty, 0 bytes"),
     "broken.npy": (b"\x93NUMPY\x01", "cannot be read as .npy"),
     "broken.ply": (b"ply\nformat", "cannot be read as .ply"),
-    "mug.txt": (b"1 2 3\n", "suffix '.txt'; expected one of"),
+    "mug.dae": (b"<COLLADA/>", "suffix '.dae'; expected one of"),
 }
 
 
