@@ -108,7 +108,7 @@ def canonical_mesh(path, unit: float, up: str, front: str) -> "trimesh.Trimesh":
     """Read a mesh file, in metres, with up +z and front +x, and check that it encloses a volume.
 
     Args:
-        path: .obj, .stl, .ply, .off or .glb file.
+        path: .obj, .stl, .ply, .glb, .gltf or .off file.
         unit: metres per unit of the file.
         up: axis of the file that points up, such as "+z".
         front: axis of the file that points to the front, such as "-x".
