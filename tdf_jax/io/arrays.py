@@ -72,8 +72,9 @@ def array_points(array: np.ndarray) -> Float[np.ndarray, "points 3"]:
 
     Args:
         array: numbers, (points, 3); (points, 4 to 20) with x y z first, as `coordinate_columns` takes them;
-            (3, points); (4, points) with a last row of ones; (height, width, 3 or more), if neighbours in both
-            directions are near each other; or an array with the fields x, y and z.
+            (3, points); (4, points) with a last row of ones; one of these with further axes of length 1;
+            (height, width, 3 or more), if neighbours in both directions are near each other; or an array with the
+            fields x, y and z.
 
     Returns:
         Point cloud, (points, 3), float64.
@@ -86,8 +87,8 @@ def array_points(array: np.ndarray) -> Float[np.ndarray, "points 3"]:
     if array.dtype.kind not in "fiu":
         raise UnsupportedError(f"has numbers of type {array.dtype}; expected floats; save points.astype(np.float64)")
     values = array.astype(np.float64)
-    while values.ndim > 2 and len(values) == 1:
-        values = values[0]
+    if values.ndim > 2:
+        values = values.squeeze()
     if values.ndim == 3 and array.dtype != np.uint8:
         return _organised(values)
     if values.ndim != 2:

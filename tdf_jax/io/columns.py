@@ -171,8 +171,8 @@ def _without_count(rows):
     if re.fullmatch(r"\d+", rows[1][1]):
         raise UnsupportedError("has single whole numbers in its first lines, as PTX has; expected x y z in each line")
     title = not _is_number(words[0])
-    if title and len(rows) - 2 == count:
-        return rows[2:]
+    if title and len(rows) - 2 == count:  # a title; names of columns are looked at as those without a count
+        return rows[1:] if named_columns(words) else rows[2:]
     if len(rows) - 1 != count:
         raise ValueError(f"its first line promises {count} points, and {len(rows) - 1 - title} follow")
     return rows[1:]

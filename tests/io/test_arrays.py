@@ -47,6 +47,8 @@ VALID = {
     "numbers from zero": np.hstack([np.arange(40)[:, None], CLOUD]),
     "numbers from one": np.hstack([np.arange(1, 41)[:, None], CLOUD, ONES]),
     "a batch of one": CLOUD[None],
+    "rows of one, as in OpenCV": CLOUD[:, None],
+    "columns of one": CLOUD[:, :, None],
     "fields": structured(),
     "fields behind others": structured(before="id label"),
     "capital fields": structured(("X", "Y", "Z")),

@@ -76,6 +76,7 @@ VALID = {
     "count and intensity, as in .pts": text(head="40\n", behind=("-1200", *COLOUR)),
     "count and an empty line": text(head="40\n\n"),
     "count and a title": text(head="40\nscan of a mug\n"),
+    "count and names": text(head="40\nz x y\n", rows=[[z, x, y] for x, y, z in POINTS]),
     "count of rows and columns": text(head="40 3\n"),
     "names of CloudCompare above a count": text(
         ";", head="//X;Y;Z;Illuminance (PCV);Nx (a)\n40\n", behind=("0.5", "1")

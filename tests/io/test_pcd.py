@@ -68,6 +68,7 @@ def packed(data=COLUMNS, pack=literal, size=None):
 
 VALID = {
     "ascii": pcd("ascii", TEXT),
+    "decimal commas, as in some countries": pcd("ascii", TEXT.replace(b".", b",")),
     "binary": pcd("binary", ROWS.tobytes()),
     "binary_compressed": pcd("binary_compressed", packed()),
     "binary_compressed with references": pcd("binary_compressed", packed(pack=greedy)),
