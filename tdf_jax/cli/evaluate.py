@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 PICTURES = ("reconstructions.png", "transfers.png")
 MOST_GENERATED = 6  # generated objects of a category in a picture
 _NONE = "(default: none)"
-Category = Literal["mug", "bowl", "bottle"]
+Category = Literal["mug", "bowl", "bottle", "rack", "container"]
 Cloud = Literal[
     "full", "views1", "views2", "views4", "points300", "points1000", "points3000", "noise", "half", "double", "all"
 ]
@@ -30,8 +30,8 @@ def evaluate(
     ] = (),
     pairs: int = 50,
     seed: int = 0,
-    size: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: 0.12, 0.20, 0.22)")] = None,
-    place: Annotated[str | None, tyro.conf.arg(help_behavior_hint="(default: handle, rim, neck)")] = None,
+    size: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: 0.12, 0.20, 0.22, 0.38, 0.28)")] = None,
+    place: Annotated[str | None, tyro.conf.arg(help_behavior_hint="(default: handle, rim, neck, peg, floor)")] = None,
     num_starts: int = 10,
     iterations: int = 100,
     clouds: tuple[Cloud, ...] = ("full",),
@@ -46,13 +46,14 @@ def evaluate(
 
     Args:
         weights: a name of shipped weights, or a .safetensors file.
-        category: category of the objects: mug, bowl or bottle; several are evaluated one after the other.
+        category: category of the objects: mug, bowl, bottle, rack or container; several are evaluated one after the
+            other.
         pairs: number of generated pairs of each category; 0 for none, with --meshes.
         seed: seed of the objects, poses, query points and starts.
         size: size of generated objects, metres: the height of a mug, the diagonal of others. A real object keeps its
             size, and the demonstration is on a generated object of that size.
         place: place that is transferred: handle, rim or base of a mug; rim, base or body of a bowl; neck, base or body
-            of a bottle.
+            of a bottle; peg, post or base of a rack, any of whose pegs is right; floor, opening or base of a container.
         num_starts: number of random starts of each transfer; the one with the lowest loss counts.
         iterations: number of Adam's steps.
         clouds: condition of the new object's cloud: full; from 1, 2 or 4 cameras; 300 to 3000 points; 300 points with 2

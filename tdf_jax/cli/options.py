@@ -21,6 +21,8 @@ from tdf_jax.io.pointclouds import load_points
 from tdf_jax.landscape.shortest_path import SHARPEST
 from tdf_jax.shapes import FAMILIES
 
+MULTI = ("mug", "bowl", "bottle")  # categories that the shipped weights `multi` were trained on
+
 
 def _option(metavar: str | None = None, default: str | None = None):
     """The words of the help for a value, and for a default that depends on other options."""
@@ -38,8 +40,8 @@ class SceneSettings:
         target_pose: pose of the target in the world: that of its file, or a random rotation and translation of it.
         demonstration: .npz file that `tdf demonstrate` wrote, or with the arrays points, wxyz_xyz and query, in metres.
         category: category of generated objects.
-        trajectory: shape of a generated demonstration, from a mug's handle, a bowl's rim or a bottle's neck to a place
-            0.30 m away; lift_over ends on a shelf there.
+        trajectory: shape of a generated demonstration, from the category's first place, such as a mug's handle,
+            to a place 0.30 m away; lift_over ends on a shelf there.
         num_poses: number of poses from the grasp to the release; a demonstration file is resampled to another number.
         queries: number of query points of a generated demonstration.
         points: number of points that are sampled from a mesh or a larger cloud.
@@ -54,7 +56,9 @@ class SceneSettings:
         Literal["given", "random"] | None, _option(default="given for a file, random for a generated object")
     ] = None
     demonstration: Annotated[Path | None, _option("FILE", "one on another generated object")] = None
-    category: Annotated[Literal["mug", "bowl", "bottle"] | None, _option(default="that of shipped weights; mug")] = None
+    category: Annotated[
+        Literal["mug", "bowl", "bottle", "rack", "container"] | None, _option(default="that of shipped weights; mug")
+    ] = None
     trajectory: Annotated[
         Literal["line", "semicircle", "wave", "lift_over", "tilt_and_pour", "hang_on_rack"] | None,
         _option(default="wave of a mug, lift_over of others"),
@@ -147,7 +151,7 @@ class LandscapeSettings(SceneSettings):
 def categories_of(weights: str | None) -> tuple[str, ...]:
     """Categories of shipped weights; mugs for other files."""
     if weights == "multi":
-        return tuple(FAMILIES)
+        return MULTI
     return (weights,) if weights in FAMILIES else ("mug",)
 
 
@@ -238,7 +242,7 @@ def make_scene(settings: SceneSettings, key: PRNGKeyArray) -> Scene:
         return generated_case(cast(str, settings.category), settings.seed, 0, points=settings.points)
 
     demonstration, target = _read_demonstration(settings), _read_target(settings)
-    demonstrated_mesh, places, fold = None, None, 1
+    demonstrated_mesh, places, fold, others = None, None, 1, ()
     T_world_target = np.eye(4) if settings.target_pose == "given" else random_pose(settings.seed, 0)
     if target is None:
         T_object_world = np.linalg.inv(pair().T_world_b)
@@ -246,6 +250,7 @@ def make_scene(settings: SceneSettings, key: PRNGKeyArray) -> Scene:
         if demonstration is None:
             places = (pair().T_world_place_a, T_world_target @ T_object_world @ pair().T_world_place_b)
             fold = pair().fold
+            others = tuple(T_world_target @ T_object_world @ T for T in pair().others)
     if demonstration is None:
         demonstration, demonstrated_mesh = _generated(settings, pair(), key), pair().object_a.mesh
     points, mesh = target
@@ -256,6 +261,7 @@ def make_scene(settings: SceneSettings, key: PRNGKeyArray) -> Scene:
         T_world_places=places,
         meshes=(demonstrated_mesh, None if mesh is None else mesh.copy().apply_transform(T_world_target)),
         fold=fold,
+        others=others,
     )
 
 

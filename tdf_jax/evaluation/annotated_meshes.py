@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     import trimesh
 
 SIDECAR = "meshes.json"
+MEASURED = ("mug", "bowl", "bottle")  # categories whose places can be measured
 DIAGONALS = (0.03, 1.0)  # metres; another diagonal means that the unit is probably wrong
 UNITS = (1.0, 0.01, 0.001, 0.0254)  # metres, centimetres, millimetres, inches
 OFF_FRONT = 10.0  # degrees, the largest angle between `front` and the longer side
@@ -166,8 +167,8 @@ def _checked(path: Path, entry) -> _Entry:
     if not isinstance(entry, dict):
         refuse(f"the entry has a JSON {type(entry).__name__}", _wanted("mug", False))
     category = entry.get("category", "mug")
-    if not isinstance(category, str) or category not in FAMILIES:
-        refuse(f"category is {category!r}", f"one of {', '.join(FAMILIES)}")
+    if not isinstance(category, str) or category not in MEASURED:
+        refuse(f"category is {category!r}", f"one of {', '.join(MEASURED)}")
     symmetries = {name: fold for fold, name in FOLDS.items()}
     symmetry = "none" if category == "mug" else entry.get("symmetry", "round")
     needed = (

@@ -43,6 +43,8 @@ class Transfer:
         T_world_b: pose of the canonical frame of object b, 4x4.
         fold: symmetry of object b about the z axis of that frame, see `tdf_jax.geometry.symmetry`.
         scale: size of both objects over a common size; it scales the query points too.
+        others: poses T_world_place_b, 4x4, of places of object b that are as right without a symmetry, such as the
+            second of two unlike pegs.
     """
 
     points_a: Float[np.ndarray, "points 3"]
@@ -52,6 +54,7 @@ class Transfer:
     T_world_b: Float[np.ndarray, "4 4"]
     fold: int
     scale: float
+    others: tuple[Float[np.ndarray, "4 4"], ...] = dataclasses.field(default=(), kw_only=True)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,7 +133,7 @@ def generated_case(
     """Pair `index` of a seed: two unseen generated objects of one size and symmetry, the second in a random pose.
 
     Args:
-        category: "mug", "bowl" or "bottle".
+        category: a category of `tdf_jax.shapes.FAMILIES`, such as "mug".
         seed: seed of the pairs.
         index: number of the pair.
         size: size of both objects before a condition of size, see `size_of`, metres; by default the common size of the
@@ -243,4 +246,5 @@ def _case(
         instance=instance,
         clouds=clouds,
         scale=SCALES.get(clouds, 1.0),
+        others=tuple(T_world_b @ T for T in b.others(place)) if isinstance(b, Shape) else (),
     )

@@ -1,5 +1,7 @@
 """The expected imitation where both objects have semantic frames, and errors of poses and paths."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -46,23 +48,32 @@ def nearest_place(
     T_world_estimate: Float[np.ndarray, "4 4"],
     T_world_place: Float[np.ndarray, "4 4"],
     fold: int,
+    others: Sequence[Float[np.ndarray, "4 4"]] = (),
 ) -> Float[np.ndarray, "4 4"]:
-    """Of the places that the symmetry of an object makes equal, the one nearest to an estimate.
+    """Of the places that the symmetry of an object makes equal, and others as right, the one nearest to an estimate.
 
     Args:
         T_world_object: pose of the object's canonical frame, 4x4.
         T_world_estimate: estimated pose of the place, 4x4.
         T_world_place: one true pose of the place, 4x4.
         fold: symmetry of the object, see `tdf_jax.geometry.symmetry`.
+        others: true poses of other places that are as right, such as the second of two unlike pegs, 4x4.
 
     Returns:
         T_world_place, 4x4.
     """
-    if fold == 1:
+    if fold == 1 and not others:
         return T_world_place
     to_object = np.linalg.inv(T_world_object)
     estimate = to_object @ np.asarray(T_world_estimate, float)
-    return T_world_object @ equivalent(estimate, to_object @ T_world_place, fold, REACH)
+    nearest = [equivalent(estimate, to_object @ place, fold, REACH) for place in (T_world_place, *others)]
+    return T_world_object @ min(nearest, key=lambda place: _gap(estimate, place))
+
+
+def _gap(T, other) -> float:
+    """Root mean square distance of six points on the axes of two frames, `REACH` from the origins, metres."""
+    moved, rotated = (np.sum((T - other)[:3, columns] ** 2) for columns in (3, slice(3)))
+    return float(np.sqrt(moved + REACH**2 * rotated / 3))
 
 
 def pose_error(

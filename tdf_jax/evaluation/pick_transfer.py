@@ -66,7 +66,7 @@ def transferred(
 def place_errors(
     estimates: Float[np.ndarray, "cases 7"], cases: Sequence[Transfer]
 ) -> tuple[Float[np.ndarray, " cases"], Float[np.ndarray, " cases"]]:
-    """Errors of estimated poses, from the nearest of the true poses that the symmetry of an object makes equal.
+    """Errors of estimated poses, from the nearest of the true poses, which are several on a symmetric object.
 
     Args:
         estimates: poses `wxyz_xyz`, (cases, 7), metres, world frame.
@@ -75,13 +75,7 @@ def place_errors(
     Returns:
         Position errors, metres, and rotation errors, degrees, both (cases,).
     """
-    T_world_estimate = np.asarray(Trajectory(jnp.asarray(estimates)).matrices, float)
-    truth = np.stack(
-        [
-            nearest_place(case.T_world_b, T, case.T_world_place_b, case.fold)
-            for T, case in zip(T_world_estimate, cases, strict=True)
-        ]
-    ).astype(np.float32)
+    truth = _truths(np.asarray(Trajectory(jnp.asarray(estimates)).matrices, float), cases).astype(np.float32)
     distance, angle = pose_error(estimates, se3.pose(truth[:, :3, :3], truth[:, :3, 3]))
     return distance, np.degrees(angle)
 
@@ -93,9 +87,17 @@ def tilts(estimates: Float[np.ndarray, "cases 7"], cases: Sequence[Transfer]) ->
         estimates: poses `wxyz_xyz`, (cases, 7), metres, world frame.
         cases: the transfers.
     """
-    up = np.asarray(Trajectory(jnp.asarray(estimates)).matrices, float)[:, :3, 2]
-    true = np.stack([case.T_world_place_b[:3, 2] for case in cases])
+    T_world_estimate = np.asarray(Trajectory(jnp.asarray(estimates)).matrices, float)
+    up, true = T_world_estimate[:, :3, 2], _truths(T_world_estimate, cases)[:, :3, 2]
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(up, true), axis=1), np.sum(up * true, axis=1)))
+
+
+def _truths(T_world_estimate, cases):
+    """The true pose of every case that is nearest to its estimate, (cases, 4, 4)."""
+    several = zip(T_world_estimate, cases, strict=True)
+    return np.stack(
+        [nearest_place(case.T_world_b, T, case.T_world_place_b, case.fold, case.others) for T, case in several]
+    )
 
 
 def place_reference(model: Model, case: Transfer, query: Float[Array, "queries 3"]) -> Reference:

@@ -28,6 +28,8 @@ from tdf_jax.networks.model import Model
 from tdf_jax.shapes import FAMILIES
 from tdf_jax.uncertainty.calibration import CURVES, logistic, ranking, recognition, surface_logit
 
+# Categories of the weights whose curves are fitted; the objects of another category are drawn from them.
+CATEGORIES = ("mug", "bowl", "bottle")
 CLOUDS = ("full", "views1", "views2", "noise")
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)  # probabilities below which an object counts as of another category
 
@@ -42,7 +44,7 @@ def evidence(model: Model, category: str, seed: int, index: int, right: bool) ->
         index: number of the case.
         right: whether the target is of that category.
     """
-    clouds, others = CLOUDS[index % len(CLOUDS)], [name for name in FAMILIES if name != category]
+    clouds, others = CLOUDS[index % len(CLOUDS)], [name for name in CATEGORIES if name != category]
     case = generated_case(category, seed, index, clouds=clouds)
     target = case if right else generated_case(others[index // len(CLOUDS) % len(others)], seed, index, clouds=clouds)
     demonstration = place_demonstration(case, "line", 2, box_query(jax.random.key(seed), QUERIES, QUERY_SIZE))

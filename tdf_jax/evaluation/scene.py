@@ -27,6 +27,7 @@ class Scene:
             generated.
         meshes: meshes of both objects, metres, world frame; None where there is none.
         fold: symmetry of a generated target about the z axis of its frame, see `tdf_jax.geometry.symmetry`.
+        others: frames of places of a generated target that are as right as the picked one, 4x4, world frame.
     """
 
     demonstration: Demonstration
@@ -35,14 +36,15 @@ class Scene:
     T_world_places: tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"]] | None
     meshes: "tuple[trimesh.Trimesh | None, trimesh.Trimesh | None]"
     fold: int = 1
+    others: tuple[Float[np.ndarray, "4 4"], ...] = ()
 
     def expected(self, goal: Float[Array, "7"], pick: Float[Array, "7"] | None = None) -> Trajectory | None:
         """The true trajectory on the target for a goal; None where it is not known.
 
         Args:
             goal: last pose, T_world_query, `wxyz_xyz`.
-            pick: estimated first pose, `wxyz_xyz`. A symmetric target has several true picks, and the trajectory begins
-                at the one nearest to the estimate.
+            pick: estimated first pose, `wxyz_xyz`. A symmetric target, or one with `others`, has several true picks,
+                and the trajectory begins at the one nearest to the estimate.
         """
         if self.T_world_places is None:
             return None
@@ -53,5 +55,5 @@ class Scene:
                 @ np.linalg.inv(demonstrated.matrices[0])
                 @ place_a
             )
-            place_b = nearest_place(self.T_world_target, estimate, place_b, self.fold)
+            place_b = nearest_place(self.T_world_target, estimate, place_b, self.fold, self.others)
         return expected_trajectory(demonstrated, place_a, place_b, goal)

@@ -57,6 +57,17 @@ class Shape(ABC):
         """Unit vector up, in the object frame."""
         return np.array([0.0, 0.0, 1.0])
 
+    def others(self, place: str) -> tuple[Float[np.ndarray, "4 4"], ...]:
+        """Frames that are as right as that of a place, such as the second of two unlike pegs.
+
+        Args:
+            place: name of the place.
+
+        Returns:
+            Frames T_object_place, (4, 4), metres, without those that the symmetry makes equal to the place.
+        """
+        return ()
+
     @staticmethod
     @abstractmethod
     def solid_of(parameters) -> Solid:

@@ -1,4 +1,4 @@
-"""Parts of solids: polygons stacked about an axis or swept along a line, their meshes and exact inside tests."""
+"""Parts of solids: polygons stacked along an axis or swept along a line, their meshes and exact inside tests."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -9,6 +9,7 @@ if TYPE_CHECKING:
 
 _AROUND = 64  # polygon corners around the body; a multiple of 8, so a square mug keeps its corners
 _TUBE_AROUND = 16  # polygon corners around the handle's tube
+_QUARTER = np.linspace(0, np.pi / 2, 9)  # angles of the corners of a rounded corner
 
 
 class Frusta(NamedTuple):
@@ -55,7 +56,23 @@ class Tube(NamedTuple):
     squareness: float
 
 
-Part = Frusta | Loft | Tube
+class Bar(NamedTuple):
+    """Stacked frusta of one convex outline along an axis in any direction, with flat sides in between.
+
+    Attributes:
+        heights: rising distances of the polygons along the axis, (rings,).
+        scales: factors on the outline there, (rings,).
+        outline: corners of the outline, counter-clockwise about the axis, which is inside, (corners, 2).
+        T_object_bar: frame of the bar, whose z axis is the axis, (4, 4).
+    """
+
+    heights: np.ndarray
+    scales: np.ndarray
+    outline: np.ndarray
+    T_object_bar: np.ndarray
+
+
+Part = Frusta | Loft | Tube | Bar
 
 
 def encloses(part: Part, points: np.ndarray) -> np.ndarray:
@@ -67,6 +84,8 @@ def encloses(part: Part, points: np.ndarray) -> np.ndarray:
             return in_loft(part, points)
         case Tube():
             return in_tube(part, points)
+        case Bar():
+            return in_bar(part, points)
 
 
 def rings(part: Part) -> np.ndarray:
@@ -78,6 +97,8 @@ def rings(part: Part) -> np.ndarray:
             return loft_rings(part)
         case Tube():
             return tube_rings(part)
+        case Bar():
+            return bar_rings(part)
 
 
 def section(aspect: float, exponent: float) -> np.ndarray:
@@ -91,6 +112,29 @@ def polygon(exponent: float, count: int) -> np.ndarray:
     angle = np.arange(count) * (2 * np.pi / count)
     corners = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return corners / np.sum(np.abs(corners) ** exponent, axis=1, keepdims=True) ** (1 / exponent)
+
+
+def circle(radius: float, count: int = _AROUND) -> np.ndarray:
+    """Corners (count, 2) of a regular polygon on a circle, counter-clockwise from +x."""
+    return radius * polygon(2.0, count)
+
+
+def rectangle(half_x: float, half_y: float, radius: float = 0.0) -> np.ndarray:
+    """Corners (corners, 2) of a rectangle whose corners are rounded by quarter circles, counter-clockwise."""
+    arc = radius * np.stack([np.cos(_QUARTER), np.sin(_QUARTER)], axis=1) if radius else np.zeros((1, 2))
+    centre = np.array([half_x - radius, half_y - radius])
+    corners = []
+    for signs in ((1, 1), (-1, 1), (-1, -1), (1, -1)):
+        corner = (centre + arc) * signs
+        corners.append(corner if signs[0] == signs[1] else corner[::-1])  # a mirror image runs the other way
+    return np.concatenate(corners)
+
+
+def outline_gauge(outline: np.ndarray, flat: np.ndarray) -> np.ndarray:
+    """Factor on a convex outline (corners, 2) about the origin at which it reaches each point of `flat` (points, 2)."""
+    ends = np.stack([outline, np.roll(outline, -1, axis=0)], axis=1)
+    edges = np.linalg.solve(ends, np.ones((len(outline), 2, 1)))[..., 0]
+    return np.max(flat @ edges.T, axis=1)
 
 
 def _gauge(flat: np.ndarray, exponent: float, count: int) -> np.ndarray:
@@ -166,6 +210,24 @@ def tube_rings(tube: Tube) -> np.ndarray:
     section = polygon(tube.squareness, _TUBE_AROUND) * tube.section
     flat = tube.line[:, None] + tube.scales[:, None, None] * section[:, :1] * tube.mitres[:, None]
     return np.stack([flat[..., 0], tube.scales[:, None] * section[:, 1], flat[..., 1]], axis=-1)
+
+
+def in_bar(bar: Bar, points: np.ndarray) -> np.ndarray:
+    """Which points (points, 3) are inside a bar."""
+    local = (points - bar.T_object_bar[:3, 3]) @ bar.T_object_bar[:3, :3]
+    scale = np.interp(local[:, 2], bar.heights, bar.scales, left=-1.0, right=-1.0)
+    inside = np.zeros(len(points), bool)
+    widest = np.max(np.sum(bar.outline**2, axis=1))
+    near = np.flatnonzero((scale > 0) & (np.sum(local[:, :2] ** 2, axis=1) <= widest * scale**2 * (1 + 1e-9)))
+    inside[near] = outline_gauge(bar.outline, local[near, :2]) <= scale[near]
+    return inside
+
+
+def bar_rings(bar: Bar) -> np.ndarray:
+    """The corners (rings, corners, 3) of a bar, along its axis."""
+    flat = bar.scales[:, None, None] * bar.outline
+    heights = np.broadcast_to(bar.heights[:, None, None], (*flat.shape[:2], 1))
+    return np.concatenate([flat, heights], axis=-1) @ bar.T_object_bar[:3, :3].T + bar.T_object_bar[:3, 3]
 
 
 def mitres(line: np.ndarray) -> np.ndarray:

@@ -48,7 +48,7 @@ class Recipe:
         points: surface points of an object.
         queries: labelled query points of an object, half uniform in the padded bounding box, half near the surface.
         cameras: cameras around an object, from which partial clouds are seen.
-        category: category of generated objects: mug, bowl or bottle.
+        category: category of generated objects: mug, bowl, bottle, rack or container.
         meshes: folder of aligned meshes of one category, instead of generated objects.
         unit: metres per unit of the mesh files.
         up: axis of the mesh files that points up.

@@ -1,4 +1,4 @@
-"""Bowls and bottles beside mugs: their cases, errors, demonstrations and commands."""
+"""Categories beside mugs: their cases, errors, demonstrations and commands."""
 
 import dataclasses
 import json
@@ -108,6 +108,26 @@ def test_errors_are_from_the_nearest_of_the_poses_that_a_symmetry_makes_equal(bo
         assert distance[0] == pytest.approx(2 * 0.03 * np.sin(np.radians(off) / 2), abs=1e-5)
 
 
+def test_any_peg_of_a_rack_is_right():
+    """Two equal pegs by symmetry, and two unlike ones because both are true."""
+    cases = [generated_case("rack", 6, index, points=60) for index in range(3, 10)]
+    kinds = {(case.fold, len(case.others)) for case in cases}
+    assert kinds == {(1, 0), (2, 0), (1, 1)}
+    for case in cases:
+        pegs = [case.T_world_b @ T for T in case.object_b.peg_frames]
+        assert len(pegs) == 1 + (case.fold == 2) + len(case.others)
+        for T in pegs:
+            distance, angle = place_errors(pose_of(T)[None], [case])
+            assert distance[0] < 1e-5 and angle[0] < 0.1
+            np.testing.assert_allclose(tilts(pose_of(T)[None], [case]), [0], atol=0.1)
+        high = pegs[-1] @ np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.02], [0, 0, 0, 1]])
+        np.testing.assert_allclose(place_errors(pose_of(high)[None], [case])[0], [0.02], atol=1e-5)
+        turned = pegs[-1] @ about_z(np.radians(50))
+        np.testing.assert_allclose(place_errors(pose_of(turned)[None], [case])[1], [50], atol=0.1)
+    # Of another place there is one, whatever the pegs.
+    assert all(not generated_case("rack", 6, index, points=60, place="post").others for index in range(3))
+
+
 @pytest.mark.parametrize("fold", FOLDS)
 def test_an_error_that_no_symmetry_makes_good_stays_whole(bottles, fold):
     """A lift and a tilt: neither is a turn about the axis."""
@@ -136,12 +156,13 @@ def test_a_tilt_is_what_no_turn_about_the_axis_changes(bottles, fold):
 
 
 def test_names_of_weights_and_categories_stand_for_each_other():
-    assert categories_of("multi") == tuple(FAMILIES) and categories_of("bowl") == ("bowl",)
+    assert categories_of("multi") == ("mug", "bowl", "bottle") and categories_of("bowl") == ("bowl",)
     assert categories_of(None) == categories_of("run/weights.safetensors") == ("mug",)
     for words, category, weights in (
         ({}, "mug", "mug"),
         ({"category": "bowl"}, "bowl", "bowl"),
         ({"weights": "bottle"}, "bottle", "bottle"),
+        ({"category": "rack"}, "rack", "rack"),
         ({"weights": "multi"}, "mug", "multi"),
         ({"weights": "multi", "category": "bottle"}, "bottle", "multi"),
         ({"weights": "mine.safetensors", "category": "bowl"}, "bowl", "mine.safetensors"),
@@ -158,9 +179,14 @@ def test_commands_name_the_families():
     from tdf_jax.cli.evaluate import Category
 
     assert typing.get_args(Category) == tuple(FAMILIES)
+    from tdf_jax.cli.shapes import shapes
+
+    assert typing.get_args(typing.get_type_hints(shapes)["category"]) == tuple(FAMILIES)
 
 
-@pytest.mark.parametrize("category", ["bowl", pytest.param("bottle", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "category", ["bowl", *(pytest.param(name, marks=pytest.mark.slow) for name in ("bottle", "rack", "container"))]
+)
 def test_a_scene_begins_at_the_categorys_place_and_ends_on_a_shelf(category):
     settings = resolved(Settings(category=category, queries=8, points=60, seed=3))
     made = options.make_scene(settings, jax.random.key(0))

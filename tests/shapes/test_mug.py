@@ -13,7 +13,9 @@ from tdf_jax.shapes import (
     HANDLE_STYLES,
     BottleParameters,
     BowlParameters,
+    ContainerParameters,
     MugParameters,
+    RackParameters,
     build_mug,
     sample_mug,
     scaled,
@@ -28,8 +30,14 @@ VARIANTS = [
 ]
 
 
-PARAMETERS = {"mug": MugParameters, "bowl": BowlParameters, "bottle": BottleParameters}
-OTHERS = ("bowl", "bottle")  # families whose own tests are elsewhere
+PARAMETERS = {
+    "mug": MugParameters,
+    "bowl": BowlParameters,
+    "bottle": BottleParameters,
+    "rack": RackParameters,
+    "container": ContainerParameters,
+}
+OTHERS = ("bowl", "bottle", "rack", "container")  # families whose own tests are elsewhere
 
 
 def sampled(seed, category="mug"):
@@ -75,13 +83,15 @@ def assert_one_closed_cup(mesh):
 # ---- every family ----
 
 
-def test_a_demonstration_picks_a_mug_at_its_handle_a_bowl_at_its_rim_and_a_bottle_at_its_neck():
+def test_the_first_place_of_a_family_is_where_a_demonstration_picks_it_or_puts_something():
     """The order is that of the places in data sets, too."""
     places = {category: family.places for category, family in FAMILIES.items()}
     assert places == {
         "mug": ("handle", "rim", "base"),
         "bowl": ("rim", "base", "body"),
         "bottle": ("neck", "base", "body"),
+        "rack": ("peg", "post", "base"),
+        "container": ("floor", "opening", "base"),
     }
 
 
@@ -93,15 +103,16 @@ def test_a_family_builds_its_category_with_its_places_in_a_frame_that_stands_upr
         shape = sampled(seed, category)
         assert shape.category == category and shape.height == shape.parameters.height
         assert_one_closed_body(
-            shape.mesh, holes={"mug": 1, "bowl": 0, "bottle": int(getattr(shape.parameters, "handle", False))}[category]
+            shape.mesh, holes={"mug": 1, "bottle": int(getattr(shape.parameters, "handle", False))}.get(category, 0)
         )
         np.testing.assert_allclose(shape.mesh.bounds[0, 2], -shape.height / 2, atol=1e-6)
         np.testing.assert_array_equal(shape.axis, [0, 0, 1])
         assert len(family.places) == 3 and set(shape.frames) == set(family.places)
-        for frame in shape.frames.values():
+        for name, frame in shape.frames.items():
             np.testing.assert_allclose(frame[:3, :3] @ frame[:3, :3].T, np.eye(3), atol=1e-12)
             np.testing.assert_allclose(np.linalg.det(frame[:3, :3]), 1.0, atol=1e-12)
-            np.testing.assert_array_equal(frame[:3, 2], [0, 0, 1])
+            if name != "peg":  # it is tilted
+                np.testing.assert_array_equal(frame[:3, 2], [0, 0, 1])
             np.testing.assert_array_equal(frame[3], [0, 0, 0, 1])
 
 
@@ -122,7 +133,7 @@ def test_contains_of_every_family_agrees_with_the_winding_number_of_the_mesh(cat
 @pytest.mark.parametrize("category, seed", [(category, seed) for category in OTHERS for seed in range(8)])
 def test_contains_of_every_family_switches_at_the_surface(category, seed):
     shape = sampled(200 + seed, category)
-    same_shape_all_the_way_up = category == "bowl" or (
+    same_shape_all_the_way_up = category != "bottle" or (
         shape.parameters.aspect == 1 and shape.parameters.squareness == 2
     )
     step = 1e-6 if same_shape_all_the_way_up and not getattr(shape.parameters, "handle", False) else 1e-4
@@ -155,6 +166,20 @@ SYMMETRIC = [
     ("bottle", {"handle": True}, 1),
     ("bottle", {"handle": True, "aspect": 0.6}, 1),
     ("bottle", {"handle": True, "squareness": 5.0}, 1),
+    ("rack", {}, 1),
+    ("rack", {"second_length": 0.085}, 2),
+    ("rack", {"second_length": 0.085, "base_outline": "square", "base_width": 0.11, "post_outline": "square"}, 2),
+    ("rack", {"second_length": 0.030}, 1),
+    ("rack", {"second_length": 0.085, "second_tilt": 0.0}, 1),
+    ("rack", {"second_length": 0.085, "second_height": 0.2}, 1),
+    ("rack", {"second_length": 0.085, "second_angle": 2.5}, 1),
+    ("rack", {"second_length": 0.085, "base_offset": 0.03}, 1),
+    ("container", {}, 4),
+    ("container", {"taper": 0.8, "rim_width": 0.01}, 4),
+    ("container", {"style": "round", "taper": 0.8, "rim_width": 0.01}, 0),
+    ("container", {"length": 0.16}, 2),
+    ("container", {"style": "round", "length": 0.16}, 2),
+    ("container", {"style": "shelf", "corner_radius": 0.0}, 1),
 ]
 
 
@@ -180,7 +205,10 @@ def test_the_fold_is_the_symmetry_of_the_solid(category, change, fold):
         assert max(differs(angle) for angle in rng.uniform(-np.pi, np.pi, 4)) < 0.03
 
 
-@pytest.mark.parametrize("category, seeds", [("mug", range(3)), ("bowl", range(12)), ("bottle", range(20))])
+@pytest.mark.parametrize(
+    "category, seeds",
+    [("mug", range(3)), ("bowl", range(12)), ("bottle", range(20)), ("rack", range(6)), ("container", range(16))],
+)
 def test_folds_of_sampled_objects_are_their_symmetries(category, seeds):
     folds = set()
     for seed in seeds:
@@ -193,19 +221,23 @@ def test_folds_of_sampled_objects_are_their_symmetries(category, seeds):
         np.testing.assert_array_equal(again, inside)
         if shape.fold:
             assert np.mean(shape.contains(turned(points, np.pi / shape.fold)) != inside) > 0.01 * inside.mean()
-    assert folds == {"mug": {1}, "bowl": {0, 2, 4}, "bottle": {0, 1, 2, 4}}[category]
+    assert folds == {"mug": {1}, "bowl": {0, 2, 4}, "rack": {1, 2}}.get(category, {0, 1, 2, 4})
 
 
 NO_LENGTHS = {
     "mug": {"squareness", "handle_style", "handle_squareness", "handle_flare"},
     "bowl": {"aspect", "squareness", "curve"},
     "bottle": {"aspect", "squareness", "shoulder_style", "shoulder_curve", "neck_taper", "cap_taper", "handle"},
+    "rack": {"base_outline", "post_outline", "peg_tilt", "second_tilt", "second_angle"},
+    "container": {"style", "taper"},
 }
 
 
 @pytest.mark.parametrize("category, change", [
     ("bowl", {"aspect": 0.7, "foot_height": 0.006, "rim_flare": 0.005, "curve": 2.5}),
     ("bottle", {"handle": True, "squareness": 4.0, "bulge": 0.002, "cap_height": 0.0, "neck_taper": 0.9}),
+    ("rack", {"second_length": 0.085, "post_outline": "square"}),
+    ("container", {"taper": 0.8, "rim_width": 0.01}),
 ])  # fmt: skip
 @pytest.mark.parametrize("factor", [0.4, 3.0])
 def test_scaled_keeps_the_shape_of_every_family(category, change, factor):
@@ -432,7 +464,7 @@ def test_bad_dimensions_are_refused_by_name(change, message):
     assert message in str(error.value)
 
 
-@pytest.mark.parametrize("category, name", [("mug", "Mug"), ("bowl", "Bowl"), ("bottle", "Bottle")])
+@pytest.mark.parametrize("category, name", [(name, name.capitalize()) for name in PARAMETERS])
 def test_bad_arguments_are_refused(category, name):
     shape = FAMILIES[category].build()
     with pytest.raises(InputError, match=rf"{name}.contains\(\): points has shape \(5, 2\)"):

@@ -143,6 +143,12 @@ def test_places_of_a_scanned_mesh_are_its_box_and_stretch_with_it(meshes):
         ("bottle", 1, 0),
         ("bottle", 3, 1),
         ("bottle", 12, 4),
+        ("rack", 0, 1),
+        ("rack", 1, 2),
+        ("container", 12, 0),
+        ("container", 7, 1),
+        ("container", 5, 2),
+        ("container", 0, 4),
     ],
 )
 def test_objects_of_every_family_have_its_places_in_order_and_their_own_symmetry(category, seed, fold):
