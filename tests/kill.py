@@ -341,7 +341,7 @@ def read(path: Path) -> object:
         lines = path.read_text().split("\n")
         return timeless([json.loads(line) for line in lines[:-1]])
     if path.suffix == ".npz":
-        with np.load(path) as arrays:
+        with path.open("rb") as file, np.load(file) as arrays:
             return {name: array_of(arrays[name]) for name in arrays.files if "seconds" not in name}
     if path.suffix == ".msgpack":
         import jax
