@@ -89,6 +89,23 @@ def replace_folder(function: str, path: str | os.PathLike, mark: str, names: Col
         ) from None
 
 
+@contextlib.contextmanager
+def temporary_folder(path: str | os.PathLike, names: Collection[str]) -> Iterator[Path]:
+    """A folder that only this user can read, and that is gone after the block.
+
+    Args:
+        path: name that the folder's name is like. What killed processes left under this name is removed.
+        names: all files that the folder may hold.
+
+    Yields:
+        The new, empty folder.
+    """
+    target = Path(path).resolve()
+    _remove_leftovers(target, names)
+    with _temporary(target, NEW, lambda folder: folder.mkdir(0o700)) as folder:
+        yield folder
+
+
 def _hidden(target: Path, ending: str) -> Path:
     """A new hidden name beside a target."""
     return target.with_name(f"{_start(target)}{secrets.token_hex(8)}.{ending}")

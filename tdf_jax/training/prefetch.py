@@ -18,6 +18,7 @@ import numpy as np
 from tdf_jax._internal import checks
 from tdf_jax._internal.devices import one_at_a_time
 from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.files import temporary_folder
 from tdf_jax.training import workers as processes
 from tdf_jax.training.batch import Batch
 from tdf_jax.training.dataset import DataSet
@@ -49,14 +50,16 @@ def prefetched(
             ask = functools.partial(pool.submit, draw, data)
         else:
             # All processes map the same files and share one copy of the objects.
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tdf_train_")))
+            files = {f"{field.name}.npy": getattr(data, field.name) for field in dataclasses.fields(data)}
+            place = Path(tempfile.gettempdir())
             try:
-                for field in dataclasses.fields(data):
-                    np.save(folder / f"{field.name}.npy", getattr(data, field.name))
+                folder = stack.enter_context(temporary_folder(place / "tdf_train", files))
+                for name, array in files.items():
+                    np.save(folder / name, array)
             except OSError as error:
                 raise InputError(
-                    f"train(): cannot write {folder} ({error.strerror or error}); expected room for the objects there. "
-                    "Set TMPDIR to another folder, or use one worker"
+                    f"train(): cannot write in {place} ({error.strerror or error}); expected room for the objects "
+                    "there. Set TMPDIR to another folder, or use one worker"
                 ) from None
             # Processes are spawned because a forked copy of a process that runs JAX may hang.
             pool = concurrent.futures.ProcessPoolExecutor(

@@ -1,6 +1,7 @@
 """Batches drawn ahead: the same and in order, whoever draws them."""
 
 import dataclasses
+import errno
 import functools
 import os
 import subprocess
@@ -80,6 +81,23 @@ def test_what_processes_draw_from_is_not_left_behind(data, tmp_path, monkeypatch
     with prefetched(who, data, 0, 2) as batches:
         next(batches)
         assert len(list(tmp_path.glob("*/*.npy"))) == len(dataclasses.fields(data))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EACCES])
+def test_a_full_disk_is_refused_by_name_and_what_a_killed_run_left_is_removed(data, tmp_path, monkeypatch, number):
+    def fails(path, array):
+        path.write_bytes(b"half")
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(prefetch.np, "save", fails)
+    left = tmp_path / ".tdf_train.0123456789abcdef.unfinished"
+    left.mkdir()
+    (left / "surface.npy").write_bytes(b"half")
+    message = rf"cannot write in {tmp_path} \({os.strerror(number)}\).* Set TMPDIR"
+    with pytest.raises(InputError, match=message), prefetched(who, data, 0, 2):
+        pass
     assert not list(tmp_path.iterdir())
 
 
