@@ -23,6 +23,7 @@ def benchmark(
     methods: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")] = ("all",),
     num_starts: int = 10,
     meshes: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint=_NONE)] = None,
+    recursive: bool = False,
     num_poses: int = 6,
     demonstrations: Annotated[tuple[int, ...], tyro.conf.arg(metavar="INT", help_behavior_hint=_NONE)] = (),
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("benchmark"),
@@ -42,6 +43,7 @@ def benchmark(
         methods: names of methods as on the page, or all.
         num_starts: number of random starts of Adam and ICP; the library's own solver takes 64 coarse ones.
         meshes: folder of real mugs with a meshes.json; see docs/guide/evaluation.md.
+        recursive: use the meshes in subfolders of that folder too.
         num_poses: number of random poses of each real mug.
         demonstrations: numbers of demonstrations, such as 1 3 5 10, for picks from several demonstrations.
         out: folder for the page; its folder runs keeps the computed attempts.
@@ -61,7 +63,7 @@ def benchmark(
     names = list(METHODS) if "all" in methods else [name for name in METHODS if name in methods]
     if meshes is not None:
         libigl("tdf benchmark")
-    targets = [] if meshes is None else load_annotated(meshes)
+    targets = [] if meshes is None else load_annotated(meshes, recursive)
     for target in targets:
         if target.category != "mug":
             raise InputError(
@@ -86,8 +88,8 @@ def benchmark(
         )
     settings = {
         "weights": weights, "pairs": pairs, "seed": seed, "height": height, "clouds": clouds, "methods": methods,
-        "num_starts": num_starts, "meshes": None if meshes is None else str(meshes), "num_poses": num_poses,
-        "demonstrations": demonstrations,
+        "num_starts": num_starts, "meshes": None if meshes is None else str(meshes), "recursive": recursive,
+        "num_poses": num_poses, "demonstrations": demonstrations,
     }  # fmt: skip
     picks = count_errors(makers, model, demonstrations, folder, seed=seed)
     extras = sections(scores, picks)

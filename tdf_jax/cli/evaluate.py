@@ -37,6 +37,7 @@ def evaluate(
     clouds: tuple[Cloud, ...] = ("full",),
     baselines: bool = False,
     meshes: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint=_NONE)] = None,
+    recursive: bool = False,
     num_poses: int = 5,
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=_NONE)] = None,
     card: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=_NONE)] = None,
@@ -61,6 +62,7 @@ def evaluate(
         baselines: evaluate also random weights, alignment of principal axes and ICP, on the same cases with as many
             starts.
         meshes: folder of real objects of these categories with a meshes.json; see docs/guide/evaluation.md.
+        recursive: use the meshes in subfolders of that folder too.
         num_poses: number of random poses of each real object.
         json: file for a record of every number.
         card: file for a model card in Markdown.
@@ -91,9 +93,9 @@ def evaluate(
     settings = {
         "weights": weights, "category": categories, "pairs": pairs, "seed": seed, "size": size, "place": place,
         "num_starts": num_starts, "iterations": iterations, "meshes": None if meshes is None else str(meshes),
-        "num_poses": num_poses, "clouds": clouds,
+        "recursive": recursive, "num_poses": num_poses, "clouds": clouds,
     }  # fmt: skip
-    targets = [] if meshes is None else load_annotated(meshes)
+    targets = [] if meshes is None else load_annotated(meshes, recursive)
     model = load_model(weights)
     unasked = sorted({target.category for target in targets} - set(categories))
     if unasked:

@@ -12,6 +12,7 @@ def shapes(
     count: int = 24,
     seed: int = 0,
     meshes: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="(default: none)")] = None,
+    recursive: bool = False,
 ) -> None:
     """Draw a contact sheet of generated objects, each with its symmetry.
 
@@ -21,6 +22,7 @@ def shapes(
         count: number of generated objects.
         seed: seed of their dimensions; training and evaluation draw others.
         meshes: folder of real objects with a meshes.json, drawn after the generated ones; see docs/guide/evaluation.md.
+        recursive: use the meshes in subfolders of that folder too.
     """
     import numpy as np
 
@@ -36,7 +38,7 @@ def shapes(
     if out.suffix != ".png" or not out.parent.is_dir():
         raise InputError(f"tdf shapes: --out is {out}; expected a .png in an existing folder")
     family = FAMILIES[category]
-    real = [] if meshes is None else [one for one in load_annotated(meshes) if one.category == category]
+    real = [] if meshes is None else [one for one in load_annotated(meshes, recursive) if one.category == category]
     generated = [family.build(family.sample(np.random.default_rng([seed, index]))) for index in range(count)]
     named = [(FOLDS[one.fold], one.mesh) for one in generated] + [
         (f"{one.name}\n{FOLDS[one.fold]}", one.mesh) for one in real

@@ -12,10 +12,13 @@ of `tdf_jax.geometry.symmetry.FOLDS`. Unless they are round, they also have a `f
 direction [x, y, z] in it, along their longer side or to their handle. `places` are frames T_object_place, 4x4, metres,
 in the canonical frame (z up, the handle or front along +x, the origin on the body's axis at mid height). Places that
 are not given are measured.
+
+The name of an entry may be a path with slashes. In a folder of folders, each may have its own `meshes.json`.
 """
 
 import dataclasses
 import json
+import posixpath
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -24,16 +27,19 @@ from jaxtyping import Bool, Float
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.axis_profiles import profile, profile_places
+from tdf_jax.evaluation.mesh_folder import deeper, file_names, is_mesh, warn_of_deeper
 from tdf_jax.evaluation.places import body, measured_places
 from tdf_jax.geometry.symmetry import FOLDS
 from tdf_jax.geometry.winding import inside
-from tdf_jax.io.meshes import AXES, MESH_SUFFIXES, file_axes, load_mesh
+from tdf_jax.io.meshes import AXES, file_axes, load_mesh
 from tdf_jax.shapes import FAMILIES
 
 if TYPE_CHECKING:
     import trimesh
 
 SIDECAR = "meshes.json"
+EXPECTED = 'expected {"mug.obj": {"unit": 1, "up": "+z", "handle": "+x"}, ...}'
+MOST_NAMED = 5  # meshes without an entry in a message
 MEASURED = ("mug", "bowl", "bottle")  # categories whose places can be measured
 DIAGONALS = (0.03, 1.0)  # metres; another diagonal means that the unit is probably wrong
 UNITS = (1.0, 0.01, 0.001, 0.0254)  # metres, centimetres, millimetres, inches
@@ -45,7 +51,7 @@ class AnnotatedMesh:
     """A mesh in its canonical frame, with its semantic places.
 
     Attributes:
-        name: name of its file, without the suffix.
+        name: path of its file in the folder, with slashes, without the suffix.
         mesh: the mesh, metres, canonical frame.
         height: height of the body, metres.
         frames: T_object_place, 4x4, by the name of the place.
@@ -78,57 +84,79 @@ class AnnotatedMesh:
         )
 
 
-def load_annotated(folder: str | Path) -> list[AnnotatedMesh]:
+def load_annotated(folder: str | Path, recursive: bool = False) -> list[AnnotatedMesh]:
     """Read the meshes that `meshes.json` of a folder names, in the order of their names.
 
     Args:
         folder: the folder.
+        recursive: read the meshes in subfolders too, which `meshes.json` of the folder or of a subfolder names.
 
     Raises:
         InputError: the folder or the sidecar is missing, an entry is malformed or names a mesh that cannot be used, or
             a mesh lies in the folder without an entry.
     """
     folder = Path(folder)
-    entries = _sidecar(folder)
-    return [_annotated(folder / name, entries[name]) for name in sorted(entries)]
+    entries = _entries(folder, recursive)
+    return [_annotated(folder / name, name, entries[name]) for name in sorted(entries)]
 
 
-def _sidecar(folder: Path) -> dict:
-    """The entries by file name; their content is not checked yet."""
-    path, expected = folder / SIDECAR, 'expected {"mug.obj": {"unit": 1, "up": "+z", "handle": "+x"}, ...}'
+def _entries(folder: Path, recursive: bool) -> dict:
+    """The entries by path in the folder; their content is not checked yet."""
     if not folder.is_dir():
         raise InputError(
             f"load_annotated(): there is no folder {folder}; expected one with meshes and their {SIDECAR}; check the "
             "path"
         )
-    if not any(folder.iterdir()):
+    files = file_names("load_annotated()", folder, recursive)
+    hint = "" if recursive else deeper("load_annotated()", folder)
+    hint = hint and f"; {hint}, if they have entries"
+    if not files and not hint:
         raise InputError(
             f"load_annotated(): the folder {folder} is empty; expected meshes and their {SIDECAR}; put them there"
         )
-    if not path.is_file():
-        raise InputError(f"load_annotated(): {folder} has no {SIDECAR}; {expected}; write one")
-    try:
-        entries = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(f"load_annotated(): {path} cannot be read as JSON ({error}); {expected}; correct it") from None
-    if not isinstance(entries, dict) or not entries:
-        got = "no entry" if entries == {} else f"a JSON {type(entries).__name__}"
-        raise InputError(f"load_annotated(): {path} holds {got}; {expected}; correct it")
-    unnamed = sorted(
-        file.name for file in folder.iterdir() if file.suffix.lower() in MESH_SUFFIXES and file.name not in entries
-    )
+    sidecars = [name for name in files if Path(name).name == SIDECAR]
+    if not sidecars:
+        raise InputError(f"load_annotated(): {folder} has no {SIDECAR}; {EXPECTED}; write one{hint}")
+    entries, owners = {}, {}
+    for sidecar in sidecars:
+        inner = sidecar.removesuffix(SIDECAR)
+        for name, entry in _sidecar(folder / sidecar).items():
+            path = posixpath.normpath(inner + name)
+            if path in entries:
+                raise InputError(
+                    f"load_annotated(): {path} has entries in {owners[path]} and {sidecar} of {folder}; expected one; "
+                    "remove the other"
+                )
+            entries[path], owners[path] = entry, sidecar
+    unnamed = [name for name in files if is_mesh(name) and name not in entries]
     if unnamed:
+        listed = ", ".join(unnamed[:MOST_NAMED])
+        listed += f" and {len(unnamed) - MOST_NAMED} more" if len(unnamed) > MOST_NAMED else ""
+        where = folder / sidecars[0] if len(sidecars) == 1 else f"any of the {len(sidecars)} {SIDECAR} in {folder}"
         raise InputError(
-            f"load_annotated(): {path} has no entry for {', '.join(unnamed)}; expected one for each mesh; add it or "
-            "move the file away"
+            f"load_annotated(): {where} has no entry for {listed}; expected one for each mesh; add it or move the file "
+            "away"
         )
-    stems = [Path(name).stem for name in entries]
+    stems = [posixpath.splitext(name)[0] for name in entries]
     twice = sorted({stem for stem in stems if stems.count(stem) > 1})
     if twice:
         raise InputError(
-            f"load_annotated(): {path} has several meshes called {', '.join(twice)}; expected different names; "
+            f"load_annotated(): {folder} has several meshes called {', '.join(twice)}; expected different names; "
             "rename one"
         )
+    if not recursive and not any("/" in name for name in entries):
+        warn_of_deeper("load_annotated()", folder)
+    return entries
+
+
+def _sidecar(path: Path) -> dict:
+    try:
+        entries = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(f"load_annotated(): {path} cannot be read as JSON ({error}); {EXPECTED}; correct it") from None
+    if not isinstance(entries, dict) or not entries:
+        got = "no entry" if entries == {} else f"a JSON {type(entries).__name__}"
+        raise InputError(f"load_annotated(): {path} holds {got}; {EXPECTED}; correct it")
     return entries
 
 
@@ -142,7 +170,7 @@ class _Entry(NamedTuple):
     places: dict
 
 
-def _annotated(path: Path, entry) -> AnnotatedMesh:
+def _annotated(path: Path, name: str, entry) -> AnnotatedMesh:
     category, fold, unit, R_file_object, given = _checked(path, entry)
     mesh = load_mesh(path, unit)
     _check_size(path, mesh, unit)
@@ -157,7 +185,7 @@ def _annotated(path: Path, entry) -> AnnotatedMesh:
         _check_front(path, fold, R_file_object, found.turned)
         mesh.apply_translation(-found.origin)
         places = profile_places(found, category, fold, path.name, wanted)
-    return AnnotatedMesh(path.stem, mesh, found.height, places | given, category, fold)
+    return AnnotatedMesh(posixpath.splitext(name)[0], mesh, found.height, places | given, category, fold)
 
 
 def _checked(path: Path, entry) -> _Entry:

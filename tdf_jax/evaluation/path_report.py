@@ -141,9 +141,10 @@ def _command(settings) -> str:
     """The command line that has these settings."""
     words = ["tdf", "benchmark"]
     for name, value in settings.items():
-        if value in (None, (), ("all",)) or (name == "num_poses" and not settings["meshes"]):
+        if value is False or value in (None, (), ("all",)) or (name == "num_poses" and not settings["meshes"]):
             continue
-        words += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else (value,))]
+        values = () if value is True else value if isinstance(value, tuple) else (value,)
+        words += [f"--{name.replace('_', '-')}", *map(str, values)]
     return shlex.join(words)
 
 

@@ -136,7 +136,10 @@ def _by_objects(outcomes: Outcomes) -> Iterator[tuple[str, dict, list[tuple[str,
 def _method(settings: Mapping[str, Any]) -> str:
     options = {name: settings[name] for name in ("seed", "pairs", "num_starts", "iterations")}
     if settings["meshes"] is not None:
-        options |= {"meshes": "DIR", "num_poses": settings["num_poses"]}
+        options |= {
+            "meshes": "DIR --recursive" if settings.get("recursive") else "DIR",
+            "num_poses": settings["num_poses"],
+        }
     options |= {name: settings[name] for name in ("category", "clouds")}
     words = " ".join(
         f"--{name.replace('_', '-')} {' '.join(value) if isinstance(value, list | tuple) else value}"

@@ -20,6 +20,7 @@ from tdf_jax._internal import checks
 from tdf_jax._internal.cache import digest
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
+from tdf_jax.evaluation.mesh_folder import deeper, file_names, is_mesh, warn_of_deeper
 from tdf_jax.geometry.symmetry import FOLDS
 from tdf_jax.geometry.winding import libigl
 from tdf_jax.io.meshes import MESH_SUFFIXES, file_axes
@@ -56,6 +57,7 @@ class Recipe:
         fold: symmetry of the meshes about the up axis: 1 none; 2 half turns, 4 quarter turns, 0 all turns leave them
             unchanged.
         stretch: repeated meshes are scaled along every axis by a random factor of up to e to this.
+        recursive: use the meshes in subfolders too, such as ShapeNet's 02876657/ID/models/model_normalized.obj.
     """
 
     seed: int = 0
@@ -71,6 +73,7 @@ class Recipe:
     front: str = "+x"
     fold: int = 1
     stretch: float = 0.15
+    recursive: bool = False
 
     def __post_init__(self):
         lowest = {"seed": 0, "objects": 1, "validation": 2, "points": 100, "queries": 100, "cameras": 4}
@@ -80,6 +83,8 @@ class Recipe:
         checks.choice("Recipe()", "fold", self.fold, FOLDS)
         if self.meshes is None and self.fold != 1:
             raise InputError("Recipe(): fold is for meshes; generated objects have their own; omit it")
+        if self.meshes is None and self.recursive:
+            raise InputError("Recipe(): recursive is for meshes, and there are none; omit it, or name their folder")
         if self.validation % 2:
             raise InputError(
                 f"Recipe(): validation is {self.validation}; expected an even number, objects come in pairs"
@@ -157,7 +162,7 @@ def build(recipe: Recipe, directory: str | Path, workers: int = 1, progress: boo
     splits = _mesh_files(recipe)
     manifest = {
         "recipe": dataclasses.asdict(recipe),
-        "files": {name: [file.name for file in files] for name, files in splits.items()},
+        "files": {name: [_short(recipe, file) for file in files] for name, files in splits.items()},
     }
     if not _claimed(directory, manifest):
         _check_meshes(recipe, [file for files in splits.values() for file in files], progress)
@@ -239,6 +244,10 @@ def _shards(recipe):
 def _unpacked(file, recipe, count):
     with np.load(file, allow_pickle=False) as arrays:
         arrays = dict(arrays)
+    sizes = {"surface": recipe.points, "queries": recipe.queries}
+    for name, size in sizes.items():  # bits do not tell their number
+        if arrays[name].shape != (count, size, 3):
+            raise ValueError(f"its {name} have shape {arrays[name].shape}; expected {(count, size, 3)}")
     for field, size in zip(BITS, (recipe.queries, recipe.points), strict=True):
         arrays[field] = np.unpackbits(arrays[field], axis=-1, count=size).astype(bool)
     arrays.setdefault("fold", np.ones(count, np.int8))  # data sets made before there were symmetric objects
@@ -282,15 +291,24 @@ def _mesh_files(recipe) -> dict[str, list[Path]]:
     if recipe.meshes is None:
         return {split: [] for split in SPLITS}
     folder = Path(recipe.meshes)
-    files = sorted(file for file in folder.glob("*") if file.suffix.lower() in MESH_SUFFIXES) if folder.is_dir() else []
+    names = file_names("tdf dataset", folder, recipe.recursive) if folder.is_dir() else []
+    files = [folder / name for name in names if is_mesh(name)]
     if len(files) < 2:
+        hint = deeper("tdf dataset", folder) if folder.is_dir() and not recipe.recursive else ""
         raise InputError(
             f"tdf dataset: {folder} holds {len(files)} mesh files; expected a folder of at least two "
-            f"({', '.join(MESH_SUFFIXES)}), aligned, of one category"
+            f"({', '.join(MESH_SUFFIXES)}), aligned, of one category{hint and '; ' + hint}"
         )
+    if not recipe.recursive:
+        warn_of_deeper("tdf dataset", folder)
     held_out = max(1, len(files) // HELD_OUT)
     files = [files[index] for index in np.random.default_rng(recipe.seed).permutation(len(files))]
     return {"training": files[held_out:], "validation": files[:held_out]}
+
+
+def _short(recipe, file: Path) -> str:
+    """Path of a mesh relative to the recipe's folder."""
+    return file.relative_to(recipe.meshes).as_posix()
 
 
 def _check_meshes(recipe, files, progress):
@@ -301,7 +319,7 @@ def _check_meshes(recipe, files, progress):
     diagonals, problems = {}, []
     for file in tqdm(files, desc="checking meshes", disable=not progress):
         try:
-            diagonals[file.name] = float(
+            diagonals[_short(recipe, file)] = float(
                 np.linalg.norm(canonical_mesh(file, recipe.unit, recipe.up, recipe.front).extents)
             )
         except InputError as error:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.errors import InputError, TdfWarning
 from tdf_jax.evaluation.annotated_meshes import load_annotated
 from tdf_jax.evaluation.axis_profiles import profile, profile_places
 from tdf_jax.evaluation.cases import mug_of
@@ -454,6 +454,36 @@ def test_bad_folders(tmp_path):
     (tmp_path / "meshes.json").write_text(json.dumps({"mug.obj": ENTRY}))
     with pytest.raises(InputError, match="mug.obj has no faces"):
         load_annotated(tmp_path)
+
+
+def test_folders_of_folders(folder, tmp_path):
+    """A sidecar at the top names meshes below by their paths; a folder below may have its own."""
+    bowl = build_bowl().mesh
+    for name in ("bowls/a/models", "bowls/b/models"):
+        (tmp_path / name).mkdir(parents=True)
+    names = [f"bowls/{name}/models/model_normalized.obj" for name in "ab"]
+    folder({"top.obj": bowl, names[0]: bowl, names[1]: bowl}, {"top.obj": BOWL, names[0]: BOWL})
+    assert [one.name for one in load_annotated(tmp_path)] == ["bowls/a/models/model_normalized", "top"]
+    with pytest.raises(InputError, match=f"meshes.json has no entry for {names[1]}; expected one for each mesh"):
+        load_annotated(tmp_path, recursive=True)
+    inner = tmp_path / "bowls" / "b" / "meshes.json"
+    inner.write_text(json.dumps({"models/model_normalized.obj": BOWL | {"unit": 0.5}}))
+    found = load_annotated(tmp_path, recursive=True)
+    assert [one.name for one in found] == [*(name.removesuffix(".obj") for name in names), "top"]
+    assert found[1].height == pytest.approx(0.5 * found[0].height)
+    inner.write_text(json.dumps({"../a/models/model_normalized.obj": BOWL}))
+    with pytest.raises(InputError, match=f"{names[0]} has entries in bowls/b/meshes.json and meshes.json of"):
+        load_annotated(tmp_path, recursive=True)
+
+
+def test_meshes_below_are_counted_where_they_are_not_read(folder, tmp_path):
+    (tmp_path / "more").mkdir()
+    build_bowl().mesh.export(tmp_path / "more" / "a.obj")
+    with pytest.raises(InputError, match=r"has no meshes.json; .*; 1 mesh lies deeper: add --recursive, .*, if they"):
+        load_annotated(tmp_path)
+    with pytest.warns(TdfWarning, match="1 mesh lies deeper: add --recursive"):
+        (found,) = load_annotated(folder({"my.obj": build_bowl().mesh}, {"my.obj": BOWL}))
+    assert found.name == "my"
 
 
 @pytest.mark.parametrize(

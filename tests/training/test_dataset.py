@@ -13,7 +13,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.errors import InputError, TdfWarning
 from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.shapes import FAMILIES, build_mug, sample_mug
 from tdf_jax.training import dataset
@@ -260,6 +260,36 @@ def test_a_folder_of_meshes_is_split_and_repeated_stretched(meshes, tmp_path):
         quiet_build(scanned_recipe(meshes), tmp_path / "data")
 
 
+def test_meshes_nested_as_shapenets_are_found_with_recursive(meshes, tmp_path):
+    pytest.importorskip("igl")
+    nested = tmp_path / "nested"
+    for index, file in enumerate(sorted(meshes.glob("mug*.obj"))):
+        (nested / "03797390" / f"a{index}" / "models").mkdir(parents=True)
+        file.rename(nested / "03797390" / f"a{index}" / "models" / "model_normalized.obj")
+    (nested / "03797390" / "a0" / "all").symlink_to(nested, target_is_directory=True)
+    with pytest.raises(InputError, match=r"nested holds 0 mesh files; .*; 4 meshes lie deeper: add --recursive"):
+        quiet_build(scanned_recipe(nested), tmp_path / "data")
+    recipe = scanned_recipe(nested, recursive=True)
+    quiet_build(recipe, tmp_path / "data")
+    files = json.loads((tmp_path / "data" / "dataset.json").read_text())["files"]
+    names = [f"03797390/a{index}/models/model_normalized.obj" for index in range(4)]
+    assert sorted(files["training"] + files["validation"]) == names
+    assert len({one.tobytes() for part in load(tmp_path / "data") for one in part.diagonal}) >= 4  # each is read
+    quiet_build(recipe, tmp_path / "data")  # and resumed
+    small = nested / "03797390" / "a1" / "models" / "model_normalized.obj"
+    trimesh.load_mesh(small).apply_scale(0.001).export(small)
+    with pytest.raises(InputError, match=r"03797390/a1/models/model_normalized\.obj measures 0\.000.* one unit"):
+        quiet_build(recipe, tmp_path / "other")
+
+
+def test_meshes_beside_used_ones_are_not_left_out_in_silence(meshes, tmp_path):
+    pytest.importorskip("igl")
+    (meshes / "more").mkdir()
+    (meshes / "more" / "mug9.obj").write_bytes((meshes / "mug1.obj").read_bytes())
+    with pytest.warns(TdfWarning, match="tdf dataset: of .*meshes, 1 mesh lies deeper: add --recursive"):
+        quiet_build(scanned_recipe(meshes), tmp_path / "data")
+
+
 def test_the_recipes_symmetry_is_that_of_its_meshes(meshes, tmp_path):
     pytest.importorskip("igl")
     quiet_build(scanned_recipe(meshes, fold=4), tmp_path / "data")
@@ -451,6 +481,7 @@ def test_a_data_set_of_another_symmetry_is_another_one():
         ({"meshes": ".", "fold": 3}, "fold is 3; expected one of 0, 1, 2, 4"),
         ({"fold": 2}, "fold is for meshes; generated objects have their own; omit it"),
         ({"fold": 0, "category": "bowl"}, "fold is for meshes"),
+        ({"recursive": True}, "recursive is for meshes, and there are none"),
     ],
 )
 def test_bad_recipes(changes, message):
