@@ -40,6 +40,11 @@ def lowest_cost_path(
         InputError: the landscape has the energies of every rotation, an end is not a finite point or lies more than a
             step outside the grid, the sharpness is not in 0 to 50, or no path inside the grid's mask joins both ends.
     """
+    if not isinstance(landscape, Landscape):
+        raise InputError(
+            f"lowest_cost_path(): landscape is a {type(landscape).__name__}; expected a Landscape, from "
+            "tdf.energy_landscape or tdf.load_landscape"
+        )
     if landscape.turned is None:
         raise InputError(
             "lowest_cost_path(): the landscape has the energies of every rotation; expected those of the best, or of "

@@ -22,7 +22,7 @@ DEPRECATED_REDUCTIONS = {"least": "min", "soft_least": "softmin"}
 TEMPERATURE = 5e-4  # temperature of the softmin; the energy of a waypoint is about 0.002 at a match and 0.01 far away
 FORMAT = 2  # format number of files; raise it if a field is removed or its meaning changes
 READABLE_FORMATS = (1, 2)  # files of format 1 have the former names of the reductions
-FRAME = "world"
+FRAME, UNIT = "world", "metre"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -40,7 +40,8 @@ class Landscape:
         temperature: temperature of the softmin, an energy.
 
     Raises:
-        InputError: `reduce` is unknown, the temperature is not above 0, or the shapes do not match.
+        InputError: `reduce` is unknown, the temperature is not above 0, the shapes do not match, or `turned` is not the
+            index of a rotation.
     """
 
     grid: Grid
@@ -62,6 +63,11 @@ class Landscape:
                 f"Landscape(): values have shape {self.values.shape}; expected {each}, or {shape} with the "
                 "index of the best rotation in `turned`"
             )
+        for name, expected in (("waypoints", (len(self.waypoints), 3)), ("rotations", (len(self.rotations), 3, 3))):
+            if np.shape(getattr(self, name)) != expected:
+                raise InputError(f"Landscape(): {name} have shape {getattr(self, name).shape}; expected {expected}")
+        if self.turned is not None:
+            _check_turned(self.turned, shape, len(self.rotations))
 
     @property
     def combined(self) -> Float[np.ndarray, "*shape"]:
@@ -114,6 +120,18 @@ class Landscape:
         return np.divmod(np.nanargmin(flat, axis=1), int(np.prod(self.grid.shape)))
 
 
+def _check_turned(turned: np.ndarray, shape: tuple[int, ...], rotations: int) -> None:
+    if turned.shape != shape or turned.dtype.kind not in "iu":
+        raise InputError(
+            f"Landscape(): turned has shape {turned.shape} and type {turned.dtype}; expected integers {shape}"
+        )
+    if turned.size and not 0 <= turned.min() <= turned.max() < rotations:
+        raise InputError(
+            f"Landscape(): turned has numbers from {turned.min()} to {turned.max()}; expected indices of the "
+            f"{rotations} rotations"
+        )
+
+
 def check_reduction(function: str, reduce: str) -> str:
     """Check how waypoints are reduced, and replace a deprecated choice.
 
@@ -150,7 +168,7 @@ def save_landscape(path: str | os.PathLike, landscape: Landscape, about: dict | 
     header = {
         "format": FORMAT,
         "frame": FRAME,
-        "unit": "metre",
+        "unit": UNIT,
         "reduce": landscape.reduce,
         "temperature": landscape.temperature,
     }
@@ -190,6 +208,11 @@ def load_landscape(path: str | os.PathLike) -> tuple[Landscape, dict]:
                 f"load_landscape(): {path} has format {header['format']}; expected one of {READABLE_FORMATS}: "
                 "compute it again"
             )
+        for name, expected in (("frame", FRAME), ("unit", UNIT)):
+            if header[name] != expected:
+                raise InputError(
+                    f"load_landscape(): {path} has the {name} {header[name]!r}; expected {expected!r}: compute it again"
+                )
         axes = tuple(arrays[f"coordinates_{axis}"] for axis in range(len(arrays["directions"])))
         grid = Grid(arrays["origin"], arrays["directions"], axes, arrays.get("mask"))
         fields = {name: arrays[name] for name in ("values", "waypoints", "rotations")}

@@ -76,7 +76,7 @@ def restore(directory: Path, params, state) -> tuple:
 
 
 def metrics(directory: Path) -> list[dict]:
-    """The rows of a run's metrics, without a line that an interruption cut short."""
+    """The rows of a run's metrics, without a line that is damaged or that an interruption cut short."""
     path = directory / METRICS
     rows = (_row(line) for line in path.read_text().splitlines()) if path.exists() else ()
     return [row for row in rows if row is not None]
@@ -112,9 +112,10 @@ def drop_later_metrics(directory: Path, step: int) -> None:
 
 def _row(line):
     try:
-        return json.loads(line)
-    except json.JSONDecodeError:
+        row = json.loads(line)
+    except (ValueError, RecursionError):
         return None
+    return row if isinstance(row, dict) and isinstance(row.get("step"), int) else None
 
 
 def _read(path, parse):
