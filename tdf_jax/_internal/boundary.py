@@ -115,9 +115,9 @@ def plain_array(function: str, name: str, value) -> np.ndarray:
     if isinstance(value, np.ma.MaskedArray):
         masked = np.count_nonzero(np.ma.getmaskarray(value))
         if masked:
+            fix = f"Remove their rows: np.asarray(np.ma.compress_rows({name}))" if value.ndim == 2 else "Fill them"
             raise InputError(
-                f"{function}: {masked} of the {value.size} numbers of {name} are masked; expected known numbers. "
-                f"Remove their rows: np.asarray(np.ma.compress_rows({name}))"
+                f"{function}: {masked} of the {value.size} numbers of {name} are masked; expected known numbers. {fix}"
             )
         return np.asarray(value)
     try:

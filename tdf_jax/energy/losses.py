@@ -15,6 +15,8 @@ from jaxtyping import Array, Float
 from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import public
 from tdf_jax._internal.deprecation import renamed_fields, renamed_keywords
+from tdf_jax._internal.errors import InputError
+from tdf_jax.energy.descriptors import check_poses
 from tdf_jax.energy.reference import Reference
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.trajectory import Trajectory
@@ -78,7 +80,11 @@ def trajectory_energy(
 
     Returns:
         The energy, a scalar.
+
+    Raises:
+        InputError: the trajectory is not of shape (poses, 7), or has another number of poses than the reference.
     """
+    _check("trajectory_energy()", trajectory, reference)
     R, t = trajectory.rotations, trajectory.translations
     return descriptor_loss(trajectory, field, reference) + pose_energy(R, t, field.origin, reference, weights)
 
@@ -94,7 +100,11 @@ def descriptor_loss(trajectory: Trajectory, field: DescriptorField, reference: R
 
     Returns:
         The loss, a scalar.
+
+    Raises:
+        InputError: as for `trajectory_energy`.
     """
+    _check("descriptor_loss()", trajectory, reference)
 
     def one(pose):
         T_world_query, descriptors = pose
@@ -173,7 +183,12 @@ def correlation_loss(
 
     Returns:
         The loss, a scalar, metres.
+
+    Raises:
+        InputError: as for `trajectory_energy`, or an unknown norm.
     """
+    _check("correlation_loss()", trajectory, reference)
+    checks.choice("correlation_loss()", "pose_norm", pose_norm, POSE_NORMS)
     return _correlation(trajectory.rotations, trajectory.translations, origin, reference, rotation_scale, pose_norm)
 
 
@@ -189,9 +204,10 @@ def compensator_loss(trajectory: Trajectory, order: str = "frobenius") -> Float[
         The loss, a scalar.
 
     Raises:
-        InputError: an unknown order.
+        InputError: an unknown order, or a trajectory that is not of shape (poses, 7).
     """
     checks.choice("compensator_loss()", "order", order, COMPENSATOR_ORDERS)
+    check_poses("compensator_loss()", trajectory)
     return _compensator(trajectory.rotations, trajectory.translations, order)
 
 
@@ -222,6 +238,15 @@ def pose_difference(
     else:
         rotation = (R - se3.rotation(target)).reshape(*R.shape[:-2], 9)
     return jnp.concatenate([translation, rotation_scale * rotation], axis=-1)
+
+
+def _check(function: str, trajectory: Trajectory, reference: Reference) -> None:
+    check_poses(function, trajectory)
+    if len(trajectory.wxyz_xyz) != len(reference.descriptors):
+        raise InputError(
+            f"{function}: the trajectory has {len(trajectory.wxyz_xyz)} poses and the reference "
+            f"{len(reference.descriptors)}; expected as many. Use resample() before describe()"
+        )
 
 
 def _correlation(R, t, origin, reference, rotation_scale, pose_norm):
