@@ -6,7 +6,7 @@
     DescriptorField + Reference --carry, solve or optimize--> Result, whose `.trajectory` is the best one
     Trajectory + obstacles --push_clear--> Trajectory
 
-`imitate` goes the whole way in one call. Lengths are in metres, angles in radians, poses `wxyz_xyz` as in jaxlie, and
+`imitate` goes the whole way in one call; with a `Target` it finds the goal on a second object. Lengths are in metres, angles in radians, poses `wxyz_xyz` as in jaxlie, and
 `T_world_query` is the pose of the query frame in the world.
 """
 
@@ -52,6 +52,7 @@ from tdf_jax.geometry.paths import (
 )
 from tdf_jax.geometry.query import (
     box_query as box_query,
+    contact_query as contact_query,
     gaussian_query as gaussian_query,
     gripper_query as gripper_query,
     lattice_query as lattice_query,
@@ -63,6 +64,7 @@ from tdf_jax.geometry.sampling import (
     thin as thin,
 )
 from tdf_jax.geometry.se3 import rotation_grid as rotation_grid, turns as turns
+from tdf_jax.geometry.target import Target as Target
 from tdf_jax.geometry.trajectory import Trajectory as Trajectory, displace as displace, resample as resample
 from tdf_jax.geometry.transport import carry_trajectory as carry_trajectory
 from tdf_jax.imitation import imitate as imitate, imitate_batch as imitate_batch
@@ -94,6 +96,7 @@ from tdf_jax.networks.refinement import refine as refine
 from tdf_jax.planning.avoidance import ClearanceConfig as ClearanceConfig, push_clear as push_clear
 from tdf_jax.planning.distances import clearance as clearance
 from tdf_jax.planning.occupied import field_obstacle as field_obstacle
+from tdf_jax.relation import relate as relate
 from tdf_jax.shapes import (
     BottleParameters as BottleParameters,
     BowlParameters as BowlParameters,
@@ -147,6 +150,7 @@ __all__ = [
     "compensator_loss",
     "confidence",
     "ConfidenceWarning",
+    "contact_query",
     "ContainerParameters",
     "convert_checkpoint",
     "correlation_loss",
@@ -195,6 +199,7 @@ __all__ = [
     "recognition",
     "Reference",
     "refine",
+    "relate",
     "resample",
     "Result",
     "rotation_grid",
@@ -214,6 +219,7 @@ __all__ = [
     "solve",
     "SolveConfig",
     "surface_logit",
+    "Target",
     "TdfWarning",
     "thin",
     "tilt_and_pour",

@@ -10,13 +10,15 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import host
 from tdf_jax._internal.deprecation import caller_level, renamed_keywords
 from tdf_jax._internal.errors import CategoryWarning, ConfidenceWarning, InputError
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference, describe
-from tdf_jax.geometry.demonstration import Demonstration
+from tdf_jax.geometry.demonstration import Demonstration, require_apart
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.model import Model
+from tdf_jax.relation import carry_object, referenced, target_field
 from tdf_jax.solvers.adam import OptimizeConfig, optimize
 from tdf_jax.solvers.initial import default_goal
 from tdf_jax.solvers.multistart import SolveConfig, solve
@@ -28,12 +30,15 @@ from tdf_jax.uncertainty.calibration import CALIBRATED, CURVES, confidence, reco
 DOUBT = 0.5
 
 
+@host
 @renamed_keywords(mesh="device_mesh")
 def imitate(
     model: Model,
     demonstration: Demonstration | Sequence[Demonstration] | Reference,
     points: Float[Array | np.ndarray, "points 3"],
     *,
+    target_points: Float[Array | np.ndarray, "target_points 3"] | None = None,
+    target_model: Model | None = None,
     key: PRNGKeyArray,
     goal: Float[Array | np.ndarray, "7"] | None = None,
     goal_offset: Float[Array | np.ndarray, "3"] | Sequence[float] | None = None,
@@ -55,6 +60,9 @@ def imitate(
         model: the network.
         demonstration: one, several with the same query points, or a `Reference` from `describe` to share between calls.
         points: point cloud of the new object, (points, 3), metres, world frame.
+        target_points: point cloud of the new target, (points, 3), metres, world frame, if the demonstration has one.
+            Without it the demonstrated target stands where it stood, and the object is placed there.
+        target_model: network of the targets; by default `model`.
         key: random key, such as `jax.random.key(0)`; the result is a function of it.
         goal: pose at the release, (7,), T_world_query as `wxyz_xyz`; by default, with `fix_last`, the demonstration's,
             moved by the centroids. Poses after the release follow it rigidly.
@@ -87,8 +95,22 @@ def imitate(
             "imitate(): energy is given, but `carry` does not minimise eq. 3; expected no energy, or "
             "config=SolveConfig() or OptimizeConfig() with it"
         )
-    reference = demonstration if isinstance(demonstration, Reference) else describe(model, demonstration)
+    reference = referenced("imitate()", model, demonstration, target_points, target_model)
+    if reference.contact is not None:
+        given = {"goal": goal is not None, "goal_offset": goal_offset is not None, "fix_last=False": not fix_last}
+        contradicting = ", ".join(name for name, is_given in given.items() if is_given)
+        if contradicting or not isinstance(config, CarryConfig):
+            raise InputError(
+                f"imitate(): {contradicting or 'config is ' + type(config).__name__}, and the demonstration has a "
+                "target, which gives the goal; expected no goal and a CarryConfig. Drop one of them"
+            )
     field = encode(model, points)
+    if reference.contact is not None:
+        target = target_field(model, target_points, target_model)
+        if target_points is not None:
+            require_apart("imitate()", points, target_points)
+        search = {"config": config, "progress": progress, "device_mesh": device_mesh}
+        return _judged(carry_object(field, target, reference, key, **search), model.info.name, field, points)
     goal = None if goal is None else jnp.asarray(checks.pose("imitate()", "goal", goal), float)
     if goal_offset is not None:
         goal = default_goal(field, reference) if goal is None else goal
@@ -131,6 +153,7 @@ def _judged(result: Result, weights: str, field, points) -> Result:
     )
 
 
+@host
 @renamed_keywords(mesh="device_mesh")
 def imitate_batch(
     model: Model,

@@ -6,6 +6,7 @@ ones through, because they are not known yet.
 """
 
 from collections.abc import Collection
+from typing import Any
 
 import jax
 import jax.core
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tdf_jax._internal.boundary import is_foreign, plain_array
 from tdf_jax._internal.errors import InputError
 
 SEEDS = 2**32  # jax truncates a larger seed to 32 bits without a warning
@@ -125,7 +127,7 @@ def coordinates(
     function: str, name: str, value: ArrayLike, rows: str = "points", least: int = 1
 ) -> np.ndarray | jax.Array:
     """Check that a value is finite points, (rows, 3), at least `least`; return an array of the caller's type."""
-    array = jnp.asarray(value) if traced(value) else np.asarray(value)
+    array = jnp.asarray(value) if traced(value) else plain_array(function, name, value)
     if array.ndim != 2 or array.shape[1] != 3 or len(array) < least or array.dtype.kind not in "fiu":
         raise InputError(f"{function}: {name} has shape {array.shape}; expected numbers ({rows}, 3), metres")
     if not traced(array) and not np.isfinite(array).all():
@@ -135,6 +137,7 @@ def coordinates(
 
 def pose(function: str, name: str, value: ArrayLike) -> ArrayLike:
     """Check that a value is one finite pose `wxyz_xyz` with a unit quaternion, near the origin; return it."""
+    value = plain_array(function, name, value) if is_foreign(value) else value
     if np.shape(value) != (7,):
         raise InputError(f"{function}: {name} has shape {np.shape(value)}; expected one pose wxyz_xyz, (7,)")
     if not traced(value):
@@ -227,7 +230,7 @@ def key(function: str, value) -> jax.Array:
     return value
 
 
-def points(function: str, value, name: str = "points"):
+def points(function: str, value: Any, name: str = "points") -> Any:
     """Check that a value is a point cloud that can be encoded, (points, 3), metres; return all of its points.
 
     Args:
@@ -243,10 +246,7 @@ def points(function: str, value, name: str = "points"):
             are no measurements, see `invalid_rows`.
     """
     if not isinstance(value, jax.Array):
-        try:
-            value = np.asarray(value)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise InputError(f"{function}: {name} is not an array of numbers: {error}") from error
+        value = plain_array(function, name, value)
     if value.dtype.kind in "iu":
         value = value.astype(np.float32) if traced(value) else np.asarray(value, np.float64)
     if not jnp.issubdtype(value.dtype, np.floating):
@@ -325,6 +325,7 @@ def _transposed(shape: tuple[int, ...]) -> str:
 
 def query(function: str, value) -> ArrayLike:
     """Check that a value is query points (queries, 3), at least one, finite; return it."""
+    value = plain_array(function, "query", value) if is_foreign(value) else value
     shape = np.shape(value)
     if len(shape) != 2 or shape[1] != 3 or shape[0] < 1:
         raise InputError(
@@ -360,6 +361,6 @@ def _scalar(function, name, value):
 
 def _array(function, name, value) -> np.ndarray:
     try:
-        return np.asarray(value, dtype=np.float64)
+        return np.asarray(plain_array(function, name, value), dtype=np.float64)
     except (TypeError, ValueError):
         raise InputError(f"{function}: {name} is {value!r}; expected numbers") from None

@@ -1,15 +1,19 @@
 """`tdf demonstrate`: a demonstration from a recorded motion and a cloud."""
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated
 
 import jax
+import jax.numpy as jnp
 import tyro
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
-from tdf_jax.geometry.query import box_query
+from tdf_jax.geometry.query import box_query, contact_query
+from tdf_jax.geometry.target import Target
 from tdf_jax.io.demonstrations import check_frames, save_demonstration
 from tdf_jax.io.pointclouds import load_points
 from tdf_jax.io.trajectories import load_trajectory
@@ -33,6 +37,8 @@ def demonstrate(
         int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 1500 of a mesh, all of a cloud)")
     ] = None,
     seed: int = 0,
+    target_object: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)")] = None,
+    contacts: int = 128,
 ) -> None:
     """Make a demonstration file for `tdf imitate --demonstration` from a recorded motion and a cloud.
 
@@ -53,6 +59,9 @@ def demonstrate(
         drop_invalid: remove points that are NaN or stand for missing measurements.
         count: number of points that are sampled from a mesh or a larger cloud.
         seed: seed of the query points and of the sampled points.
+        target_object: point cloud or mesh of the object that the first one is placed on or in, as it stands at the
+            release, in the unit of the points file; `tdf imitate --target-object` then finds the goal on a new one.
+        contacts: number of contact points, drawn where the two objects meet at the release.
     """
     command = "tdf demonstrate"
     if len(query_box) not in (1, 3):
@@ -62,6 +71,12 @@ def demonstrate(
     query = box_query(jax.random.key(seed), queries, size, query_centre)
     cloud = load_points(points, count, scale, seed, drop_invalid=drop_invalid)
     demonstration = Demonstration(cloud, load_trajectory(trajectory), query, grasp, release)
+    if target_object is not None:
+        # With another seed, because samples of one mesh by one seed are the same points.
+        placed = load_points(target_object, count, scale, (seed + 1) % checks.SEEDS, drop_invalid=drop_invalid)
+        moved = se3.transform(demonstration.object_motion, jnp.asarray(cloud))
+        region = contact_query(moved, placed, jax.random.fold_in(jax.random.key(seed), 1), contacts)
+        demonstration = dataclasses.replace(demonstration, target=Target(placed, region))
     check_frames(command, demonstration)
     if num_poses is not None:
         demonstration = demonstration.resampled(num_poses)

@@ -14,6 +14,7 @@ import tyro
 from tqdm import tqdm
 
 import tdf_jax
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file, replace_folder
 from tdf_jax.cli.options import Settings, make_scene, resolved
@@ -22,8 +23,10 @@ from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import describe
 from tdf_jax.evaluation.metrics import path_error, pose_error
 from tdf_jax.evaluation.scene import Scene
+from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.imitation import DOUBT, imitate as imitate_scene
+from tdf_jax.io.pointclouds import load_points
 from tdf_jax.io.trajectories import save_trajectory
 from tdf_jax.networks.checkpoint import load_model
 from tdf_jax.networks.model import Model
@@ -66,15 +69,20 @@ def _run(settings: Settings, folder: Path, pictures: Pictures) -> dict:
             energy = EnergyWeights() if settings.k is None else EnergyWeights(settings.k)
         model = load_model(str(settings.weights))  # `resolved` has put the name of the category's weights
         scene = make_scene(settings, query_key)
+        target_model, target_points = _target(settings, model)
+        related = scene.demonstration.target is not None
+        offset = None if related and not any(settings.goal_offset) else settings.goal_offset
     with _timed(seconds, "encode"):
-        reference = jax.block_until_ready(describe(model, scene.demonstration))
+        reference = jax.block_until_ready(describe(model, scene.demonstration, target_model=target_model))
     with _timed(seconds, "optimise"), _progress(config.num_steps) as progress:
         result = imitate_scene(
             model,
             reference,
             scene.points,
+            target_points=target_points,
+            target_model=target_model,
             key=start_key,
-            goal_offset=np.array(settings.goal_offset),
+            goal_offset=None if offset is None else np.array(offset),
             energy=energy,
             config=config,
             progress=progress,
@@ -85,11 +93,25 @@ def _run(settings: Settings, folder: Path, pictures: Pictures) -> dict:
     if not settings.no_plots:
         with _timed(seconds, "plots"):
             rows = "start" if isinstance(config, OptimizeConfig) else "candidate"
-            _draw(folder, scene, result, rows, pictures)
+            _draw(folder, scene, target_points, result, rows, pictures)
     seconds["total"] = time.perf_counter() - began
     record = _record(settings, model, scene, energy, config, result, seconds)
     replace_file("tdf imitate", folder / RESULT, json.dumps(record, indent=1).encode())
     return record
+
+
+def _target(settings: Settings, model: Model) -> tuple[Model | None, np.ndarray | None]:
+    """Network and points of the new target; None where there is none."""
+    if settings.target_object is None:
+        return None, None
+    points = load_points(
+        settings.target_object,
+        settings.points,
+        settings.scale,
+        (settings.seed + 1) % checks.SEEDS,  # samples of one mesh by one seed are the same points
+        drop_invalid=settings.drop_invalid,
+    )
+    return model if settings.target_weights is None else load_model(settings.target_weights), points
 
 
 def _config(settings: Settings) -> CarryConfig | SolveConfig | OptimizeConfig:
@@ -107,7 +129,9 @@ def _config(settings: Settings) -> CarryConfig | SolveConfig | OptimizeConfig:
     return CarryConfig(**starts)
 
 
-def _draw(folder: Path, scene: Scene, result: Result, rows: str, pictures: Pictures) -> None:
+def _draw(
+    folder: Path, scene: Scene, target_points: np.ndarray | None, result: Result, rows: str, pictures: Pictures
+) -> None:
     with pictures.drawing(folder / "imitation.png") as path:
         from tdf_jax.viz.imitation import imitation_figure
         from tdf_jax.viz.style import save_figure
@@ -115,9 +139,14 @@ def _draw(folder: Path, scene: Scene, result: Result, rows: str, pictures: Pictu
         trajectory = result.trajectory
         expected = scene.expected(trajectory.wxyz_xyz[-1], trajectory.wxyz_xyz[0])
         title = _title(float(result.loss), _errors(trajectory, expected))
-        save_figure(
-            path, imitation_figure(scene.demonstration, scene.points, trajectory, expected, scene.meshes, title)
-        )
+        demonstration, points, meshes = scene.demonstration, scene.points, scene.meshes
+        if demonstration.target is not None:
+            # One cloud of both objects each; a demonstrated target that stands where it stood is on both sides.
+            stands = demonstration.target.points if target_points is None else target_points
+            points, meshes = np.concatenate([points, stands]), (None, None)
+            both = np.concatenate([demonstration.points, demonstration.target.points])
+            demonstration = Demonstration(both, demonstration.trajectory, demonstration.query)
+        save_figure(path, imitation_figure(demonstration, points, trajectory, expected, meshes, title))
     with pictures.drawing(folder / "loss.png") as path:
         from tdf_jax.viz.imitation import loss_figure
         from tdf_jax.viz.style import save_figure
@@ -204,6 +233,7 @@ def _record(
         "modes": _modes(config, result),
         "errors": _errors(trajectory, expected),
         "goal": _plain(result.goal),
+        "relation": _relation(scene, result),
         "expected": None if expected is None else _plain(expected.wxyz_xyz),
         "energies": _plain(result.energies),
         "losses": _plain(result.candidate_history),
@@ -242,6 +272,10 @@ def _table(record: dict, out: Path) -> str:
         "time": f"{seconds['total']:.1f} s ({parts})",
         "written to": str(out),
     }
+    if record["relation"] is not None:
+        relation = record["relation"]
+        angle = np.degrees(relation["moved_radians"])
+        rows["object moves"] = f"{100 * relation['moved_metres']:.1f} cm and {angle:.0f} degrees, to the target"
     if record["modes"] is not None:
         rows["solutions"] = _solutions(record["modes"])
     if record["recognised"] is not None:
@@ -253,6 +287,22 @@ def _table(record: dict, out: Path) -> str:
                 "show the place to pick to the camera, remove other objects from the cloud, check weights"
             )
     return "\n".join(f"{name:<17}{value}" for name, value in rows.items())
+
+
+def _relation(scene: Scene, result: Result) -> dict | None:
+    """Where the object goes on the target; None if the demonstration has no target."""
+    if scene.demonstration.target is None:
+        return None
+    motion = Trajectory(result.object_motion[None]).matrices[0]
+    centroid = scene.points.mean(axis=0)
+    moved = pose_error(result.object_motion, np.array([1.0, 0, 0, 0, 0, 0, 0]))[1]
+    return {
+        "object_motion": _plain(result.object_motion),
+        "moved_metres": float(np.linalg.norm(motion[:3, :3] @ centroid + motion[:3, 3] - centroid)),
+        "moved_radians": float(moved),
+        "T_world_contact": _plain(result.target_trajectories[result.best, 0]),
+        "target_residual": _plain(float(result.target_residual)),
+    }
 
 
 def _modes(config, result) -> list[dict] | None:

@@ -12,6 +12,8 @@ import jax
 import tyro
 from tqdm import tqdm
 
+from tdf_jax._internal.boundary import own_settings
+from tdf_jax._internal.devices import platform_problem
 from tdf_jax._internal.errors import InputError, TdfWarning
 from tdf_jax.cli.pictures import PictureError
 from tdf_jax.cli.streams import guarded, lost
@@ -79,7 +81,7 @@ def _code(arguments: Sequence[str]) -> int | str | None:
     """Run one command, and give its exit code; None if it ends without one."""
     stopped: list[signal.Signals] = []
     try:
-        with _warnings(), _signals(stopped):
+        with _warnings(), _signals(stopped), own_settings():
             commands = {name: getattr(importlib.import_module(f"tdf_jax.cli.{name}"), name) for name in COMMANDS}
             tyro.extras.subcommand_cli_from_dict(
                 commands,
@@ -104,6 +106,9 @@ def _code(arguments: Sequence[str]) -> int | str | None:
             return _failed(f"error: {error}", 1)
         if isinstance(error, KeyboardInterrupt):
             return _failed(SIGNALS[signal.SIGINT], 128 + signal.SIGINT)
+        problem = platform_problem()
+        if problem is not None:  # JAX_PLATFORMS=cuda without a GPU
+            return _failed(f"error: {problem}", 2)
         raise
     return None
 

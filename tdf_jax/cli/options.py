@@ -78,6 +78,9 @@ class Settings(SceneSettings):
 
     Attributes:
         goal_offset: translation that is added to the goal, metres, world frame.
+        target_object: mesh or point cloud of the object that the new one is placed on or in, in the unit of --target;
+            the demonstration file must have one too. Without it the demonstrated one stands where it stood.
+        target_weights: a name of shipped weights, or a .safetensors file, for --target-object.
         k: weight of the correlation term of eq. 3, for the methods that minimise it; the paper's best is 0.02.
         method: carry the demonstration from the pick to the goal; or minimise the paper's energy, eq. 3, by damped
             Gauss-Newton, or by Adam as in the paper.
@@ -89,6 +92,8 @@ class Settings(SceneSettings):
     """
 
     goal_offset: Annotated[tuple[float, float, float], _option("X Y Z")] = (0.0, 0.0, 0.0)
+    target_object: Annotated[Path | None, _option("FILE", "none")] = None
+    target_weights: Annotated[str | None, _option("NAME|FILE", "those of --weights")] = None
     k: Annotated[float | None, _option("FLOAT", "0.02")] = None
     method: Literal["carry", "gauss-newton", "adam"] = "carry"
     num_starts: Annotated[int | None, _option("INT", "64 of the pick; 10 of other methods")] = None
@@ -209,6 +214,12 @@ def _check_numbers(settings: SceneSettings) -> None:
         if settings.k is not None:
             checks.number("tdf imitate", "--k", settings.k, 0)
         checks.vector("tdf imitate", "--goal-offset", settings.goal_offset)
+        if settings.target_object is not None and settings.demonstration is None:
+            raise InputError(
+                "tdf imitate: --target-object needs a --demonstration with a target; give one, see tdf demonstrate"
+            )
+        if settings.target_weights is not None and settings.target_object is None:
+            raise InputError("tdf imitate: --target-weights is for a --target-object; give one, or drop it")
     if isinstance(settings, LandscapeSettings):
         for name in ("half", "radius", "pitch"):
             checks.positive("tdf landscape", f"--{name}", getattr(settings, name), "metres")

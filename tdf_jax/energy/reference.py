@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.descriptors import trajectory_descriptor
 from tdf_jax.geometry.demonstration import Demonstration
@@ -20,13 +21,48 @@ from tdf_jax.networks.model import Model
 COMBINATIONS = ("mean", "median")
 
 
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=[
+        "query",
+        "object_descriptors",
+        "target_descriptors",
+        "T_object_contact",
+        "T_target_contact",
+        "T_world_contact",
+    ],
+    meta_fields=[],
+)
+@dataclasses.dataclass(frozen=True)
+class Contact:
+    """Descriptors and poses of the region where object and target of a demonstration meet.
+
+    Attributes:
+        query: contact points, (queries, 3), metres, contact frame.
+        object_descriptors: descriptors of the region in the object's field, (queries, channels).
+        target_descriptors: descriptors of the region in the target's field, (queries, channels); None if the target
+            was not encoded, because it stands where it stood.
+        T_object_contact: pose of the contact frame on the object before the grasp, relative to the centroid of its
+            cloud, axes of the world, `wxyz_xyz`, (7,).
+        T_target_contact: pose of the contact frame relative to the centroid of the target's cloud, (7,).
+        T_world_contact: pose of the contact frame at the release, world frame, (7,).
+    """
+
+    query: Float[Array, "queries 3"]
+    object_descriptors: Float[Array, "queries channels"]
+    target_descriptors: Float[Array, "queries channels"] | None
+    T_object_contact: Float[Array, "7"]
+    T_target_contact: Float[Array, "7"] | None
+    T_world_contact: Float[Array, "7"]
+
+
 def _no_poses() -> Array:
     return jnp.zeros((0, 7))
 
 
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=["descriptors", "trajectory", "query", "approach", "retreat"],
+    data_fields=["descriptors", "trajectory", "query", "approach", "retreat", "contact"],
     meta_fields=[],
 )
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +76,7 @@ class Reference:
         query: query points, (queries, 3), metres, query frame.
         approach: poses T_object_query before the grasp, (before, 7), `wxyz_xyz`; usually none.
         retreat: poses T_object_query after the release, (after, 7); usually none.
+        contact: region where object and target meet; None if the demonstrations have no target.
     """
 
     descriptors: Float[Array, "poses queries channels"]
@@ -47,9 +84,17 @@ class Reference:
     query: Float[Array, "queries 3"]
     approach: Float[Array, "before 7"] = dataclasses.field(default_factory=_no_poses)
     retreat: Float[Array, "after 7"] = dataclasses.field(default_factory=_no_poses)
+    contact: Contact | None = None
 
 
-def describe(model: Model, demonstrations: Demonstration | Sequence[Demonstration], combine: str = "mean") -> Reference:
+@public
+def describe(
+    model: Model,
+    demonstrations: Demonstration | Sequence[Demonstration],
+    combine: str = "mean",
+    *,
+    target_model: Model | None = None,
+) -> Reference:
     """Encode one or several demonstrations.
 
     Args:
@@ -59,13 +104,15 @@ def describe(model: Model, demonstrations: Demonstration | Sequence[Demonstratio
         combine: how the descriptors of several demonstrations are combined, channel by channel: "mean", as in NDF, or
             "median", which minimises the sum of absolute differences of eq. 2 (docs/results/benchmark.md compares
             them).
+        target_model: network that encodes the targets of the demonstrations, such as `model` itself; None leaves them
+            out, which does for a target that stands where it stood.
 
     Returns:
         The reference.
 
     Raises:
         InputError: there is no demonstration, an argument is not a `Demonstration`, demonstrations differ in query
-            points or number of poses, or `combine` is unknown.
+            points, contact points or number of poses, some have a target and some have none, or `combine` is unknown.
     """
     checks.choice("describe()", "combine", combine, COMBINATIONS)
     demonstrations = list(demonstrations) if isinstance(demonstrations, Iterable) else [demonstrations]
@@ -82,13 +129,57 @@ def describe(model: Model, demonstrations: Demonstration | Sequence[Demonstratio
     query = jnp.asarray(first.query)
     fields = [encode(model, demo.points) for demo in demonstrations]
     several = [_describe(field, demo.transfer, query) for field, demo in zip(fields, demonstrations)]
-    descriptors = (
-        sum(several[1:], several[0]) / len(several) if combine == "mean" else jnp.median(jnp.stack(several), axis=0)
-    )
+    descriptors = _combined(several, combine)
     transfer, approach, retreat = (
         _relative(part.wxyz_xyz, fields[0].origin) for part in (first.transfer, first.approach, first.retreat)
     )
-    return Reference(descriptors, Trajectory(transfer), query, approach, retreat)
+    contact = _contact(demonstrations, fields, target_model, combine)
+    return Reference(descriptors, Trajectory(transfer), query, approach, retreat, contact)
+
+
+def _contact(demonstrations, fields, target_model, combine) -> Contact | None:
+    """The region where object and target meet, in the fields of both."""
+    targets = [demo.target for demo in demonstrations]
+    if all(target is None for target in targets):
+        return None
+    first = targets[0]
+    for other in targets:
+        if first is None or other is None or not np.array_equal(other.query, first.query):
+            raise InputError(
+                "describe(): demonstrations differ in their contact points, or some have no target; expected one set "
+                "of contact points in the contact frame, and a target in each"
+            )
+    query = jnp.asarray(first.query)
+    seen = [
+        _describe(field, Trajectory(demo.T_object_contact[None]), query)[0]
+        for demo, field in zip(demonstrations, fields, strict=True)
+    ]
+    on_object = _relative(demonstrations[0].T_object_contact[None], fields[0].origin)[0]
+    described = on_target = None
+    if target_model is not None:
+        target_fields = [encode(target_model, target.points) for target in targets]
+        described = _combined(
+            [
+                _describe(field, Trajectory(jnp.asarray(target.T_world_contact)[None]), query)[0]
+                for field, target in zip(target_fields, targets, strict=True)
+            ],
+            combine,
+        )
+        on_target = _relative(np.asarray(first.T_world_contact)[None], target_fields[0].origin)[0]
+    return Contact(
+        query,
+        _combined(seen, combine),
+        described,
+        on_object,
+        on_target,
+        jnp.asarray(first.T_world_contact, on_object.dtype),
+    )
+
+
+def _combined(several: list[Array], combine: str) -> Array:
+    if combine == "mean":
+        return sum(several[1:], several[0]) / len(several)
+    return jnp.median(jnp.stack(several), axis=0)
 
 
 def _relative(wxyz_xyz, origin) -> Array:

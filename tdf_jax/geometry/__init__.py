@@ -9,6 +9,7 @@ Modules:
     sampling: points of a surface; farthest-point sampling
     se3: rotations and rigid poses
     symmetry: equivalent poses of symmetric objects
+    target: the second object of a relation, and the region where the two meet
     trajectory: poses of the query frame; resampling and displacing
     transport: a demonstrated path warped to new ends
     views: what cameras see of an object

@@ -7,8 +7,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.errors import InputError
+from tdf_jax.geometry import se3
+from tdf_jax.geometry.target import Target, require_contact
 from tdf_jax.geometry.trajectory import Trajectory, check_trajectory, resample
+
+SAME_POINT = 1e-5  # metres within which a point of the object is one of the target, and not only close to it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,10 +29,12 @@ class Demonstration:
         query: query points, (queries, 3), metres, query frame.
         grasp: index of the pose at which the object is grasped, the pick.
         release: index of the pose at which it is released, not before the grasp; negative indices count from the end.
+        target: object that the first one is placed on or in; None where the goal is given.
 
     Raises:
         InputError: the points are not a point cloud, the trajectory fails `check_trajectory`, the query points are not
-            (queries, 3) and finite, an index is outside of the trajectory, or the release is before the grasp.
+            (queries, 3) and finite, an index is outside of the trajectory, the release is before the grasp, the contact
+            points of the target are not at the released object, or object and target share points.
     """
 
     points: Float[Array | np.ndarray, "points 3"]
@@ -35,16 +42,19 @@ class Demonstration:
     query: Float[Array | np.ndarray, "queries 3"]
     grasp: int = 0
     release: int = -1
+    target: Target | None = None
 
+    @public
     def __post_init__(self):
-        checks.points("Demonstration()", self.points)
+        # Stored as the checks return them, so that lists and arrays of other libraries do not travel on.
+        object.__setattr__(self, "points", checks.points("Demonstration()", self.points))
         if not isinstance(self.trajectory, Trajectory):
             raise InputError(
                 f"Demonstration(): trajectory is a {type(self.trajectory).__name__}; "
                 "expected a Trajectory, such as tdf.wave()"
             )
         check_trajectory(self.trajectory)
-        checks.query("Demonstration()", self.query)
+        object.__setattr__(self, "query", checks.query("Demonstration()", self.query))
         count = self.trajectory.num_poses
         for name in ("grasp", "release"):
             checks.count("Demonstration()", name, getattr(self, name), -count, count - 1)
@@ -57,22 +67,47 @@ class Demonstration:
             if not checks.traced(array):
                 coordinates = np.asarray(array)
                 checks.near("Demonstration()", name, coordinates[:, -3:], coordinates)
+        if self.target is not None:
+            self._check_target(self.target)
 
     @property
+    @public
+    def object_motion(self) -> Float[Array, "7"]:
+        """Motion of the object from the grasp to the release, `wxyz_xyz`: its point x as it lies ends at D x."""
+        poses = jnp.asarray(self.transfer.wxyz_xyz)
+        return se3.compose(poses[-1], se3.inverse(poses[0]))
+
+    @property
+    @public
+    def T_object_contact(self) -> Float[Array, "7"]:
+        """Pose of the contact frame on the object as it lies before the grasp, world frame, `wxyz_xyz`.
+
+        Raises:
+            InputError: there is no target.
+        """
+        if self.target is None:
+            raise InputError("Demonstration.T_object_contact: there is no target; expected Demonstration(target=...)")
+        return se3.compose(se3.inverse(self.object_motion), jnp.asarray(self.target.T_world_contact))
+
+    @property
+    @public
     def transfer(self) -> Trajectory:
         """Poses from the grasp to the release, between which the object moves with the query frame."""
         return self._part(self._first, self._last + 1)
 
     @property
+    @public
     def approach(self) -> Trajectory:
         """Poses before the grasp; none unless the recording begins earlier."""
         return self._part(0, self._first)
 
     @property
+    @public
     def retreat(self) -> Trajectory:
         """Poses after the release; none unless the recording ends later."""
         return self._part(self._last + 1, self.trajectory.num_poses)
 
+    @public
     def resampled(self, num_poses: int) -> "Demonstration":
         """Resample the poses from the grasp to the release, as `resample` does; approach and retreat are unchanged.
 
@@ -91,6 +126,20 @@ class Demonstration:
         last = self._first + num_poses - 1
         return dataclasses.replace(self, trajectory=Trajectory(poses), grasp=self._first, release=last)
 
+    def _check_target(self, target: Target) -> None:
+        if not isinstance(target, Target):
+            raise InputError(f"Demonstration(): target is a {type(target).__name__}; expected a tdf.Target")
+        if self._first == self._last:
+            raise InputError(
+                "Demonstration(): there is a target, and grasp and release are one pose; expected the motion between"
+            )
+        if checks.traced(self.points, self.trajectory, target.points, target.query, target.T_world_contact):
+            return
+        cloud = np.asarray(self.points, np.float64)
+        contact = np.asarray(self.T_object_contact)
+        require_contact("Demonstration()", "object, moved to the release", cloud, np.asarray(target.query), contact)
+        require_apart("Demonstration()", cloud, target.points)
+
     @property
     def _first(self) -> int:
         return self.grasp % self.trajectory.num_poses
@@ -101,3 +150,31 @@ class Demonstration:
 
     def _part(self, begin: int, end: int) -> Trajectory:
         return Trajectory(self.trajectory.wxyz_xyz[begin:end])
+
+
+def require_apart(function: str, points, target_points) -> None:
+    """Check that the clouds of object and target do not show the same points.
+
+    Args:
+        function: name that the message begins with.
+        points: point cloud of the object, (points, 3), metres.
+        target_points: point cloud of the target, (points, 3), metres.
+
+    Raises:
+        InputError: more than a tenth of the object's points are points of the target.
+    """
+    if checks.traced(points, target_points):
+        return
+    cloud = np.asarray(points, np.float64)
+    shared = np.isin(_cells(cloud), _cells(np.asarray(target_points, np.float64))).sum()
+    if shared > len(cloud) / 10:
+        raise InputError(
+            f"{function}: {shared} of the {len(cloud)} points of the object are points of the target too; expected two "
+            "clouds without common points: cut the object out of the target's cloud"
+        )
+
+
+def _cells(cloud: np.ndarray) -> np.ndarray:
+    """A number for each point that equal points share."""
+    cells = np.round(cloud / SAME_POINT).astype(np.int64)
+    return cells[:, 0] + (cells[:, 1] << 21) + (cells[:, 2] << 42)

@@ -1,6 +1,7 @@
 """Regular grids of points along a line, in a plane or in a volume of the world, on which energies are evaluated."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -40,7 +41,11 @@ class Grid:
 
     def __post_init__(self):
         origin = checks.vector("Grid()", "origin", self.origin)
-        directions = np.asarray(self.directions, dtype=float)
+        directions = _numbers("Grid()", "directions", self.directions)
+        if not isinstance(self.coordinates, Sequence | np.ndarray):
+            raise InputError(
+                f"Grid(): coordinates are {self.coordinates!r}; expected one list of numbers for each axis"
+            )
         if directions.shape not in {(1, 3), (2, 3), (3, 3)} or len(self.coordinates) != len(directions):
             raise InputError(
                 f"Grid(): directions have shape {directions.shape} and there are {len(self.coordinates)} lists of "
@@ -48,7 +53,7 @@ class Grid:
             )
         if not np.allclose(directions @ directions.T, np.eye(len(directions)), atol=ORTHONORMAL_TOLERANCE):
             raise InputError(f"Grid(): directions are {directions.tolist()}; expected perpendicular unit vectors")
-        axes = tuple(np.asarray(steps, dtype=float) for steps in self.coordinates)
+        axes = tuple(_numbers("Grid()", "coordinates", steps) for steps in self.coordinates)
         for name, steps in zip("first second third".split(), axes):
             if steps.ndim != 1 or len(steps) < 2:
                 raise InputError(
@@ -65,7 +70,9 @@ class Grid:
             ):
                 raise InputError(f"Grid(): the steps of the {name} axis differ; expected even ones, as of np.linspace")
         axes = tuple(np.linspace(steps[0], steps[-1], len(steps)) for steps in axes)
-        mask = None if self.mask is None else np.asarray(self.mask, dtype=bool)
+        mask = None if self.mask is None else np.asarray(self.mask)
+        if mask is not None and mask.dtype != bool:
+            raise InputError(f"Grid(): mask has type {mask.dtype}; expected one boolean for each point")
         for name, value in (("origin", origin), ("directions", directions), ("coordinates", axes), ("mask", mask)):
             object.__setattr__(self, name, value)
         if mask is not None and (mask.shape != self.shape or not mask.any()):
@@ -126,9 +133,10 @@ def plane_grid(
                 f"plane_grid(): axes is {axes!r}; expected one of {', '.join(PLANES)}, or two unit vectors"
             )
         axes = np.eye(3)[["xyz".index(axis) for axis in axes]]
-    if np.shape(axes) != (2, 3):
-        raise InputError(f"plane_grid(): axes have shape {np.shape(axes)}; expected two vectors (2, 3)")
-    return Grid(centre, np.asarray(axes), (steps, steps))
+    directions = _numbers("plane_grid()", "axes", axes)
+    if directions.shape != (2, 3):
+        raise InputError(f"plane_grid(): axes have shape {directions.shape}; expected two vectors (2, 3)")
+    return Grid(centre, directions, (steps, steps))
 
 
 @public
@@ -155,7 +163,8 @@ def volume_grid(
     """
     steps = _symmetric_steps("volume_grid()", half, count)
     centre = np.asarray(checks.vector("volume_grid()", "origin", origin))
-    return Grid(centre, np.eye(3) if axes is None else np.asarray(axes), (steps, steps, steps))
+    directions = np.eye(3) if axes is None else _numbers("volume_grid()", "axes", axes)
+    return Grid(centre, directions, (steps, steps, steps))
 
 
 @public
@@ -183,9 +192,13 @@ def path_grid(
     """
     corners = path.translations if isinstance(path, Trajectory) else path
     corners = np.asarray(checks.coordinates("path_grid()", "path", corners, "poses"), dtype=float)
-    if not 0 < step <= radius < np.inf:
+    for name, value in (("radius", radius), ("step", step)):
+        checks.positive("path_grid()", name, value, "metres")
+    if not step <= radius:
         raise InputError(f"path_grid(): step is {step} and radius {radius}; expected 0 < step <= radius, metres")
-    axes = np.eye(3) if axes is None else np.asarray(axes, dtype=float)
+    axes = np.eye(3) if axes is None else _numbers("path_grid()", "axes", axes)
+    if axes.shape != (3, 3):
+        raise InputError(f"path_grid(): axes have shape {axes.shape}; expected three vectors (3, 3)")
     along = (corners - corners[0]) @ axes.T / step
     low, high = along.min(axis=0), along.max(axis=0)
     reach = radius / step
@@ -214,6 +227,17 @@ def distance_from_polyline(
         along = np.clip((points - start) @ step / max(step @ step, np.finfo(float).tiny), 0, 1)
         distance = np.minimum(distance, np.linalg.norm(points - start - along[:, None] * step, axis=1))
     return distance
+
+
+def _numbers(function: str, name: str, value: ArrayLike) -> np.ndarray:
+    """The value as float64, if it is an array of numbers."""
+    try:
+        array = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        array = np.empty(0, object)
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{function}: {name} has type {array.dtype}; expected numbers")
+    return array.astype(float)
 
 
 def _symmetric_steps(function: str, half: float, count: int) -> np.ndarray:

@@ -311,6 +311,8 @@ def _along_curve(
 def _ends(function: str, start: ArrayLike, end: ArrayLike, rotation: ArrayLike | None, end_rotation: ArrayLike | None):
     """Both translations and both rotation matrices."""
     start, end = checks.vector(function, "start", start), checks.vector(function, "end", end)
+    checks.near(function, "start", np.asarray(start)[None])
+    checks.near(function, "end", np.asarray(end)[None])
     if not np.linalg.norm(end - start) > 0:
         raise InputError(f"{function}: start and end are both {start.tolist()}; expected two different points")
     R_start = _matrix(function, "rotation", np.eye(3) if rotation is None else rotation)

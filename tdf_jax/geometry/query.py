@@ -12,8 +12,11 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from numpy.typing import ArrayLike
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
+from tdf_jax._internal.errors import InputError
 
 
+@public
 def box_query(
     key: PRNGKeyArray,
     count: int = 500,
@@ -41,6 +44,7 @@ def box_query(
     return middle + edges * jax.random.uniform(key, (count, 3), minval=-0.5, maxval=0.5)
 
 
+@public
 def gaussian_query(
     key: PRNGKeyArray, count: int = 500, sigma: float = 0.025, centre: ArrayLike = (0.0, 0.0, 0.0)
 ) -> Float[Array, "queries 3"]:
@@ -64,6 +68,7 @@ def gaussian_query(
     return jnp.asarray(checks.vector("gaussian_query()", "centre", centre)) + sigma * jax.random.normal(key, (count, 3))
 
 
+@public
 def gripper_query(
     key: PRNGKeyArray,
     count: int = 500,
@@ -105,6 +110,63 @@ def gripper_query(
     return jnp.asarray(centres)[box] + jnp.asarray(sizes)[box] * point
 
 
+@public
+def contact_query(
+    points_a: Float[Array | np.ndarray, "points_a 3"],
+    points_b: Float[Array | np.ndarray, "points_b 3"],
+    key: PRNGKeyArray,
+    count: int = 128,
+    *,
+    spread: float = 0.02,
+) -> Float[Array, "queries 3"]:
+    """Sample query points around the region where two clouds meet, for `Target`.
+
+    The region is where the clouds are closest: each point of one cloud is paired with its nearest point of the other.
+    Query points are normally distributed about the middles of pairs, which are drawn with weights that fall by a factor
+    e where the distance exceeds the smallest one by `spread`, or by the spacing of the clouds if that is larger.
+
+    Args:
+        points_a: point cloud of the object at the release, (points, 3), metres, world frame.
+        points_b: point cloud of the target, (points, 3), metres, world frame.
+        key: random key.
+        count: number of query points, at least 1.
+        spread: standard deviation of the query points about a middle, metres.
+
+    Returns:
+        Query points, (count, 3), metres, world frame: contact points for a target whose contact frame is the world.
+
+    Raises:
+        InputError: a cloud is not a point cloud, the clouds are farther apart than either is large, count is below 1,
+            or spread is not above 0.
+    """
+    from scipy.spatial import KDTree
+
+    a, b = (
+        np.asarray(checks.points("contact_query()", points, name), np.float64)
+        for points, name in ((points_a, "points_a"), (points_b, "points_b"))
+    )
+    checks.key("contact_query()", key)
+    checks.count("contact_query()", "count", count)
+    checks.positive("contact_query()", "spread", spread, "metres")
+    trees = KDTree(a), KDTree(b)
+    to_b, in_b = (np.asarray(part) for part in trees[1].query(a))
+    to_a, in_a = (np.asarray(part) for part in trees[0].query(b))
+    distance = np.concatenate([to_b, to_a])
+    extent = max(np.linalg.norm(np.ptp(a, axis=0)), np.linalg.norm(np.ptp(b, axis=0)))
+    if distance.min() > extent:
+        raise InputError(
+            f"contact_query(): the clouds are {distance.min():.3g} m apart; expected them to meet. Move the object's "
+            "cloud by its motion from the grasp to the release"
+        )
+    spacing = max(np.median(np.asarray(tree.query(tree.data, k=2)[0])[:, 1]) for tree in trees)
+    middles = np.concatenate([a + b[in_b], b + a[in_a]]) / 2
+    logits = (distance.min() - distance) / max(spread, spacing)
+    key_pair, key_point = jax.random.split(key)
+    pair = jax.random.categorical(key_pair, jnp.asarray(logits), shape=(count,))
+    return jnp.asarray(middles)[pair] + spread * jax.random.normal(key_point, (count, 3))
+
+
+@public
 def lattice_query(
     shape: Sequence[int] = (6, 6, 7), pitch: float = 0.012, centre: ArrayLike = (0.0, 0.0, 0.0)
 ) -> Float[Array, "queries 3"]:
@@ -128,6 +190,7 @@ def lattice_query(
     return jnp.asarray(checks.vector("lattice_query()", "centre", centre)) + jnp.asarray(points)
 
 
+@public
 def snapped_query(
     query: Float[Array, "queries 3"], pitch: float, centre: ArrayLike = (0.0, 0.0, 0.0)
 ) -> Float[Array, "queries 3"]:

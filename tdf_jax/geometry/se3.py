@@ -168,13 +168,13 @@ def turns(axis: ArrayLike, count: int, start: Float[Array, "3 3"] | None = None)
         Rotation matrices, (count, 3, 3).
 
     Raises:
-        InputError: count is below 1, or the axis is zero or not finite.
+        InputError: count is below 1, the axis is zero or not finite, or start is no rotation matrix.
     """
     direction = np.asarray(checks.direction("turns()", "axis", axis))
     checks.count("turns()", "count", count)
     angles = 2 * np.pi * np.arange(count) / count
     rotations = np.asarray(exp(jnp.asarray(angles[:, None] * direction / np.linalg.norm(direction))))
-    return rotations if start is None else rotations @ np.asarray(start)
+    return rotations if start is None else rotations @ np.asarray(checks.orientation("turns()", "start", start))
 
 
 @jax.jit

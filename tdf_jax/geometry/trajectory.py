@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import is_foreign, public
 from tdf_jax._internal.deprecation import renamed_keywords, warn
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
@@ -41,16 +42,19 @@ class Trajectory:
         return self.num_poses
 
     @property
+    @public
     def rotations(self) -> Float[Array, "poses 3 3"]:
         """Rotation matrices, (poses, 3, 3)."""
         return se3.rotation(self.wxyz_xyz)
 
     @property
+    @public
     def translations(self) -> Float[Array, "poses 3"]:
         """Translations, (poses, 3), metres, world frame."""
         return se3.translation(self.wxyz_xyz)
 
     @property
+    @public
     def matrices(self) -> Float[Array, "poses 4 4"]:
         """Homogeneous matrices, (poses, 4, 4)."""
         upper = jnp.concatenate([self.rotations, self.translations[..., None]], axis=-1)
@@ -58,6 +62,7 @@ class Trajectory:
         return jnp.concatenate([upper, lower], axis=-2)
 
     @classmethod
+    @public
     def from_matrices(cls, T_world_query: Float[Array, "poses 4 4"]) -> "Trajectory":
         """Make a trajectory of homogeneous matrices.
 
@@ -84,6 +89,7 @@ class Trajectory:
                 )
         return check_trajectory(cls(se3.pose(T[:, :3, :3], T[:, :3, 3])))
 
+    @public
     def transformed(self, T_new_world: Float[Array, "7"]) -> "Trajectory":
         """Apply a rigid transform of the world: T_new_query = T_new_world T_world_query.
 
@@ -95,6 +101,7 @@ class Trajectory:
         """
         return Trajectory(se3.compose(jnp.asarray(T_new_world), self.wxyz_xyz))
 
+    @public
     def shifted(self, offset: ArrayLike) -> "Trajectory":
         """Add a vector to every translation.
 
@@ -136,7 +143,7 @@ def check_trajectory(trajectory: Trajectory, name: str = "trajectory") -> Trajec
             quaternion differs from 1 by more than 1e-3, as in arrays of another order.
     """
     wxyz_xyz = trajectory.wxyz_xyz
-    if not isinstance(wxyz_xyz, jax.Array | np.ndarray):
+    if not isinstance(wxyz_xyz, jax.Array | np.ndarray) or is_foreign(wxyz_xyz):
         raise InputError(f"check_trajectory(): {name}.wxyz_xyz is a {type(wxyz_xyz).__name__}; expected an array")
     if wxyz_xyz.ndim != 2 or wxyz_xyz.shape[1] != 7:
         raise InputError(f"check_trajectory(): {name}.wxyz_xyz has shape {wxyz_xyz.shape}; expected (poses, 7)")
@@ -155,6 +162,7 @@ def check_trajectory(trajectory: Trajectory, name: str = "trajectory") -> Trajec
     return trajectory
 
 
+@public
 @renamed_keywords(poses="num_poses")
 def resample(trajectory: Trajectory, num_poses: int) -> Trajectory:
     """Resample a path to another number of poses, evenly spaced by the length of the translations' polyline.
@@ -186,6 +194,7 @@ def resample(trajectory: Trajectory, num_poses: int) -> Trajectory:
     return Trajectory(se3.pose(se3.geodesic(R[i], R[i + 1], fraction), translations))
 
 
+@public
 def displace(trajectory: Trajectory, offset: ArrayLike, where: Literal["start", "goal"] = "goal") -> Trajectory:
     """Displace one end of a trajectory; the other poses stay, as in the displacements of the paper's table 1.
 

@@ -5,10 +5,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.trajectory import Trajectory
 
+# Metres of the path that repeat the demonstration after the pick and before the goal.
+DEPARTURE, ARRIVAL = 0.05, 0.08
 
+
+@public
 def carry_trajectory(demonstrated: Trajectory, pick: Float[Array, "7"], goal: Float[Array, "7"] | None) -> Trajectory:
     """Warp a demonstrated path to start at a pick and to end at a goal.
 
@@ -40,6 +45,54 @@ def carry_trajectory(demonstrated: Trajectory, pick: Float[Array, "7"], goal: Fl
     t = demonstrated.translations
     translations = (1 - s)[:, None] * se3.transform(pick_motion, t) + s[:, None] * se3.transform(goal_motion, t)
     return Trajectory(se3.pose(se3.multiply(R, demonstrated.rotations), translations))
+
+
+def carry_to_target(
+    demonstrated: Trajectory,
+    pick: Float[Array, "7"],
+    goal: Float[Array, "7"],
+    target_motion: Float[Array, "7"],
+    *,
+    departure: float = DEPARTURE,
+    arrival: float = ARRIVAL,
+) -> Trajectory:
+    """Warp a demonstrated path between a pick and a goal at a target, repeating the demonstrated motion at both ends.
+
+    Near the pick, the gripper repeats its motion relative to the object: pose T_i becomes A T_i, where A takes the
+    first pose to the pick. Near the goal, the object repeats its motion relative to the target: with the motion
+    D_i = T_i inverse(T_0) of the object, D = D_n and the motion B of the target, pose i becomes
+    B D_i inverse(D) inverse(B) times the goal. Between them the two are blended by the length of the path, with the
+    SO(3) geodesic and a smooth step.
+
+    Args:
+        demonstrated: demonstrated path from the grasp to the release, T_world_query.
+        pick: first pose of the new path, T_world_query, `wxyz_xyz`, (7,), metres.
+        goal: last pose of the new path.
+        target_motion: motion B of the target from the demonstration, `wxyz_xyz`, (7,): a point x of the demonstrated
+            target is at B x on the new one. In the frame of `demonstrated`.
+        departure: length of the path that repeats the demonstration after the pick, metres.
+        arrival: length of the path that repeats the demonstration before the goal, metres. Of a path that is shorter
+            than both, each part is shortened in proportion.
+
+    Returns:
+        The warped path, T_world_query, with as many poses.
+    """
+    poses = jnp.asarray(demonstrated.wxyz_xyz)
+    pick_motion = se3.compose(jnp.asarray(pick), se3.inverse(poses[0]))
+    leaving = se3.compose(pick_motion, poses)
+    relative = se3.compose(poses, se3.inverse(poses[-1]))  # D_i inverse(D)
+    at_target = se3.compose(se3.compose(jnp.asarray(target_motion), relative), se3.inverse(jnp.asarray(target_motion)))
+    arriving = se3.compose(at_target, jnp.asarray(goal))
+    steps = jnp.linalg.norm(jnp.diff(poses[:, 4:], axis=0), axis=1)
+    length = jnp.concatenate([jnp.zeros(1, steps.dtype), jnp.cumsum(steps)])
+    total = jnp.maximum(length[-1], 1e-9)
+    share = jnp.minimum(1.0, 0.8 * total / (departure + arrival))
+    begin, end = share * departure, total - share * arrival
+    s = jnp.clip((length - begin) / (end - begin), 0.0, 1.0)
+    s = s * s * (3 - 2 * s)
+    R = se3.geodesic(se3.rotation(leaving), se3.rotation(arriving), s)
+    t = (1 - s)[:, None] * leaving[:, 4:] + s[:, None] * arriving[:, 4:]
+    return Trajectory(se3.pose(R, t))
 
 
 @jax.jit

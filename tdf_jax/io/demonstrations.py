@@ -7,17 +7,20 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
+from tdf_jax.geometry.target import Target
 from tdf_jax.geometry.trajectory import Trajectory
 
 ARRAYS = ("points", "wxyz_xyz", "query")
 INDICES = {"grasp": 0, "release": -1}  # with the values that files without them have
-# Raised when a file holds what an older tdf_jax must not ignore, such as the target of a relation. Files without a
+TARGET_ARRAYS = ("target_points", "contact_query", "T_world_contact")
+# Files with a target are of schema 3, so that an older tdf_jax does not ignore it, others of schema 2; files without a
 # number are of schema 1.
-SCHEMA = 2
+SCHEMA, TARGET_SCHEMA = 2, 3
 # Diagonals of a cloud between which its unit may be metres: a grain of rice and a van.
 SMALLEST, LARGEST = 0.003, 10.0
 UNITS = {"millimetres": 0.001, "centimetres": 0.01}
@@ -26,6 +29,7 @@ UNITS = {"millimetres": 0.001, "centimetres": 0.01}
 FARTHEST_GRASP = 2.0
 
 
+@public
 def save_demonstration(path: str | os.PathLike, demonstration: Demonstration) -> None:
     """Write a demonstration.
 
@@ -33,7 +37,8 @@ def save_demonstration(path: str | os.PathLike, demonstration: Demonstration) ->
         path: .npz file in an existing folder. It holds the arrays `points`, the object point cloud before the grasp,
             (points, 3), metres, world frame; `wxyz_xyz`, the poses T_world_query, (poses, 7); `query`, the query
             points, (queries, 3), metres, query frame; and the integers `grasp` and `release`, the indices of the poses
-            at which the object is grasped and released, and `schema`.
+            at which the object is grasped and released, and `schema`. With a target it also holds `target_points`,
+            (points, 3), `contact_query`, (queries, 3), and `T_world_contact`, (7,), see `Target`.
         demonstration: demonstration to write.
 
     Raises:
@@ -48,9 +53,15 @@ def save_demonstration(path: str | os.PathLike, demonstration: Demonstration) ->
         "release": np.int64(demonstration.release),
         "schema": np.int64(SCHEMA),
     }
+    target = demonstration.target
+    if target is not None:
+        values = (target.points, target.query, target.T_world_contact)
+        arrays |= {name: np.asarray(value) for name, value in zip(TARGET_ARRAYS, values, strict=True)}
+        arrays["schema"] = np.int64(TARGET_SCHEMA)
     replace_file("save_demonstration", path, lambda file: np.savez(file, **arrays))
 
 
+@public
 def load_demonstration(path: str | os.PathLike) -> Demonstration:
     """Read a demonstration that `save_demonstration` wrote, or any .npz file with its first three arrays.
 
@@ -72,7 +83,7 @@ def load_demonstration(path: str | os.PathLike) -> Demonstration:
         raise InputError(f"load_demonstration(): there is no file {path}; check the path")
     try:
         with path.open("rb") as file, np.lib.npyio.NpzFile(file, allow_pickle=False) as archive:
-            names = (*ARRAYS, *INDICES, "schema")
+            names = (*ARRAYS, *INDICES, *TARGET_ARRAYS, "schema")
             arrays = {name: archive[name] for name in names if name in archive}
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
         raise InputError(f"load_demonstration(): {path} cannot be read as .npz ({error}); save it again") from None
@@ -87,20 +98,31 @@ def load_demonstration(path: str | os.PathLike) -> Demonstration:
         if arrays[name].shape != () or arrays[name].dtype.kind not in "iu":
             raise InputError(f"load_demonstration(): {name} in {path} is {arrays[name]}; expected one integer")
         integers[name] = int(arrays[name])
-    if not 1 <= integers.pop("schema") <= SCHEMA:
+    if not 1 <= integers["schema"] <= TARGET_SCHEMA:
         raise InputError(
-            f"load_demonstration(): {path} has schema {arrays['schema']}; expected 1 to {SCHEMA}. Use the tdf_jax that "
+            f"load_demonstration(): {path} has schema {arrays['schema']}; expected 1 to {TARGET_SCHEMA}. Use the tdf_jax that "
             "wrote it, or a newer one"
         )
+    given = [name for name in TARGET_ARRAYS if name in arrays]
+    if given and len(given) < len(TARGET_ARRAYS):
+        raise InputError(
+            f"load_demonstration(): {path} has a target, but of its arrays only {', '.join(given)}; expected all of "
+            f"{', '.join(TARGET_ARRAYS)}"
+        )
     points, wxyz_xyz, query = (arrays[name].astype(np.float64) for name in ARRAYS)
+    grasp, release = integers["grasp"], integers["release"]
     try:
         # Checked in float64, because far coordinates and bad norms would be rounded away.
-        demonstration = Demonstration(points, Trajectory(wxyz_xyz), query, **integers)  # pyright: ignore[reportArgumentType]
+        target = Target(*(arrays[name].astype(np.float64) for name in TARGET_ARRAYS)) if given else None
+        path_in_double = Trajectory(wxyz_xyz)  # pyright: ignore[reportArgumentType]
+        demonstration = Demonstration(points, path_in_double, query, grasp, release, target)
         check_frames("load_demonstration()", demonstration)
     except InputError as error:
         raise InputError(f"load_demonstration(): {path}: {error}") from None
+    if target is not None:
+        target = Target(*(arrays[name].astype(np.float32) for name in TARGET_ARRAYS))
     trajectory = Trajectory(jnp.asarray(wxyz_xyz, jnp.float32))
-    return Demonstration(points.astype(np.float32), trajectory, query.astype(np.float32), **integers)
+    return Demonstration(points.astype(np.float32), trajectory, query.astype(np.float32), grasp, release, target)
 
 
 def check_frames(function: str, demonstration: Demonstration) -> None:

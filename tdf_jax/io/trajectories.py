@@ -9,11 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
 from tdf_jax.geometry.trajectory import Trajectory, check_trajectory
 
 
+@public
 def save_trajectory(path: str | Path, trajectory: Trajectory) -> None:
     """Write a trajectory.
 
@@ -38,6 +40,7 @@ def save_trajectory(path: str | Path, trajectory: Trajectory) -> None:
     replace_file("save_trajectory", path, write)
 
 
+@public
 def load_trajectory(path: str | Path) -> Trajectory:
     """Read a trajectory written by `save_trajectory`, or another program's .tum or .csv file.
 

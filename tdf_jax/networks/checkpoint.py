@@ -16,6 +16,7 @@ import safetensors
 import safetensors.numpy
 from flax.traverse_util import flatten_dict, unflatten_dict
 
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.cache import digest
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
@@ -40,6 +41,7 @@ def available_models() -> tuple[str, ...]:
     return tuple(_shipped())
 
 
+@public
 def save_model(model: Model, path: str | os.PathLike) -> None:
     """Write a model to a file. The write is atomic, and equal models give equal files.
 
@@ -72,6 +74,7 @@ def save_model(model: Model, path: str | os.PathLike) -> None:
     replace_file("save_model", target, safetensors.numpy.save(tensors, {METADATA_KEY: json.dumps(header)}))
 
 
+@public
 def load_model(name_or_path: str | os.PathLike) -> Model:
     """Read a model by name or from a file, and verify its checksum.
 
@@ -147,7 +150,11 @@ def _locate(name_or_path: str | os.PathLike) -> Path:
             f"or the path of a {SUFFIX} file"
         )
     path = shipped[path.name] if is_name else path
-    if not path.is_file():
+    try:
+        found = path.is_file()
+    except OSError:  # a name that is too long
+        found = False
+    if not found:
         raise InputError(f"load_model(): there is no file {path}; check the path, or use a shipped model ({names})")
     return path
 
@@ -208,7 +215,7 @@ def _check_shapes(found: Mapping[str, tuple[int, ...]], config: NetworkConfig) -
         raise _Refusal(f"its {len(found)} tensors cannot be those of {config}")
     problems = shape_problems(found, parameter_shapes(config))
     if problems:
-        raise _Refusal(f"the tensors are not those of its network, {config}: {problems}")
+        raise _Refusal(f"the tensors are not those of its network, {config}: {problems}; save the model again")
 
 
 def _check_types(found: Mapping[str, str], expected: str) -> None:

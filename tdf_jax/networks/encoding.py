@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.deprecation import caller_level, renamed_keywords
 from tdf_jax._internal.errors import InputError, SizeWarning
 from tdf_jax._internal.precision import full_precision
@@ -29,6 +30,7 @@ SIZE_TOLERANCE = 3.0
 UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254}
 
 
+@public
 @renamed_keywords(thinnings="num_subsamples")
 def encode(
     model: Model, points: Float[Array | np.ndarray, "points 3"], num_subsamples: int = NUM_SUBSAMPLES

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import host
 from tdf_jax._internal.deprecation import renamed_fields, renamed_keywords
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import EnergyWeights
@@ -86,6 +87,7 @@ class CarryConfig:
         return SolveConfig(num_trajectory_starts=1, search_steps=1, propagate_steps=1, **settings)
 
 
+@host
 @renamed_keywords(mesh="device_mesh")
 def carry(
     field: DescriptorField,

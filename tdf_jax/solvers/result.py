@@ -10,11 +10,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.deprecation import renamed_fields
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.reference import Reference
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.trajectory import Trajectory
+
+
+def _no_contacts() -> np.ndarray:
+    return np.zeros((0, 1, 7), np.float32)
 
 
 def _unknown() -> np.ndarray:
@@ -33,6 +38,9 @@ def _unknown() -> np.ndarray:
         "residual",
         "confidence",
         "recognised",
+        "target_trajectories",
+        "target_residual",
+        "target_confidence",
     ],
     meta_fields=["grasp", "release"],
 )
@@ -60,6 +68,12 @@ class Result:
             with weights that it is calibrated for.
         recognised: probability that the object is of the demonstration's category, in [0, 1], see
             `tdf_jax.recognition`; a scalar, set by `imitate` with shipped weights.
+        target_trajectories: pose of the contact frame on the target of each candidate, (candidates, 1, 7),
+            T_world_contact; no candidates unless the demonstration has a target.
+        target_residual: normalised descriptor energy of the contact points on the target, of the best candidate; a
+            scalar, NaN if the target stands where it stood.
+        target_confidence: probability that the contact pose on the target is right; a scalar, NaN where it is not
+            calibrated.
         grasp: index of the pose at which the object is grasped; poses before it are the approach.
         release: index of the pose at which it is released, from the end: -1 unless there is a retreat.
     """
@@ -72,16 +86,23 @@ class Result:
     residual: Float[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_unknown)
     confidence: Float[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_unknown)
     recognised: Float[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_unknown)
+    target_trajectories: Float[Array | np.ndarray, "*batch targets 1 7"] = dataclasses.field(
+        default_factory=_no_contacts
+    )
+    target_residual: Float[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_unknown)
+    target_confidence: Float[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_unknown)
     grasp: int = 0
     release: int = -1
 
     @property
+    @public
     def finite(self) -> Bool[Array | np.ndarray, "*batch candidates"]:
         """Which candidates are finite."""
         xp = self._numpy
         return xp.isfinite(self.energies) & xp.isfinite(xp.asarray(self.trajectories)).all(axis=(-2, -1))
 
     @property
+    @public
     def best(self) -> int | Int[Array | np.ndarray, "*batch"]:
         """Index of the finite candidate with the least energy; of a batch, one for each result.
 
@@ -98,33 +119,45 @@ class Result:
         return best if checks.traced(finite) or np.ndim(best) else int(best)
 
     @property
+    @public
     def trajectory(self) -> Trajectory:
         """The best trajectory, T_world_query."""
         index = jnp.asarray(self.best)[..., None, None, None]
         return Trajectory(jnp.take_along_axis(jnp.asarray(self.trajectories), index, axis=-3)[..., 0, :, :])
 
     @property
+    @public
     def picks(self) -> Float[Array | np.ndarray, "*batch candidates 7"]:
         """Pose of the query frame at the grasp of every candidate, T_world_query, `wxyz_xyz`."""
         return self.trajectories[..., self.grasp, :]
 
     @property
+    @public
     def pick(self) -> Float[Array, "*batch 7"]:
         """Pose of the query frame at the grasp, of the best trajectory, T_world_query, `wxyz_xyz`."""
         return self.trajectory.wxyz_xyz[..., self.grasp, :]
 
     @property
+    @public
     def goal(self) -> Float[Array, "*batch 7"]:
         """Pose of the query frame at the release, of the best trajectory, T_world_query, `wxyz_xyz`."""
         return self.trajectory.wxyz_xyz[..., self.release, :]
 
     @property
+    @public
+    def object_motion(self) -> Float[Array, "*batch 7"]:
+        """Motion of the object from the grasp to the release, `wxyz_xyz`: a point x of it as it lies ends at M x."""
+        return se3.compose(self.goal, se3.inverse(self.pick))
+
+    @property
+    @public
     def loss(self) -> float | Float[Array | np.ndarray, "*batch"]:
         """Energy of the best trajectory; a Python float outside a trace, unless there is a batch."""
         loss = jnp.take_along_axis(jnp.asarray(self.energies), jnp.asarray(self.best)[..., None], axis=-1)[..., 0]
         return loss if checks.traced(loss) or loss.ndim else float(loss)
 
     @property
+    @public
     def status(self) -> str:
         """How the candidates ended, in words."""
         finite = np.asarray(self.finite)
@@ -142,11 +175,13 @@ class Result:
     def _pruned(self) -> bool:
         return np.shape(self.energies)[-1] != np.shape(self.history)[-2]
 
+    @public
     def __repr__(self) -> str:
         rows = self._summary()
         width = max(map(len, rows))
         return "\n".join(["Result", *(f"  {name:<{width}}  {value}" for name, value in rows.items())])
 
+    @public
     def _repr_html_(self) -> str:
         left = "style='text-align:left'"
         rows = "".join(
@@ -168,7 +203,7 @@ class Result:
         }
         if not np.asarray(self.finite).any():
             return rows
-        pick = np.asarray(self.pick)
+        pick = np.asarray(self.picks)[self.best]
         energies = np.sort(np.asarray(self.energies)[np.asarray(self.finite)])
         others = ", ".join(f"{energy:.5f}" for energy in energies[1:4]) + (", ..." if len(energies) > 4 else "")
         rows["pick"] = f"xyz {_numbers(pick[4:])} m, wxyz {_numbers(pick[:4])} (T_world_query)"

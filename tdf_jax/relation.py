@@ -1,0 +1,275 @@
+"""Relations: where an object goes on a second object, the target, from the region where the two met in a demonstration.
+
+The region is found twice, by descriptors: on the target as it stands, pose X_t of the contact frame, and on the object
+as it lies, pose X_o. The object's motion M = X_t inverse(X_o) brings the two together. With the demonstrated motion D
+of the object, and the motions A_t of the region on the target and A_o of the region on the object,
+M = A_t D inverse(A_o).
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import host
+from tdf_jax._internal.errors import InputError
+from tdf_jax.energy.losses import EnergyWeights
+from tdf_jax.energy.reference import Contact, Reference, describe
+from tdf_jax.energy.residual import pick_residual
+from tdf_jax.geometry import se3
+from tdf_jax.geometry.demonstration import Demonstration
+from tdf_jax.geometry.trajectory import Trajectory, resample
+from tdf_jax.geometry.transport import carry_to_target
+from tdf_jax.networks.encoding import encode
+from tdf_jax.networks.field import DescriptorField
+from tdf_jax.networks.model import Model
+from tdf_jax.solvers.multistart import solve
+from tdf_jax.solvers.pick import CarryConfig, carry
+from tdf_jax.solvers.result import Result, with_ends
+from tdf_jax.uncertainty.modes import cluster_poses
+
+# Folded into the key, so that the pick is the same with and without a target.
+OBJECT_STREAM, TARGET_STREAM = 0x0B1EC7, 0x7A26E7
+SPACING = 0.01  # metres between the poses of a path to a target: fewer cannot hold the approach
+MAX_POSES = 200
+MAX_SOLUTIONS = 25  # candidates of a result: distinct picks times distinct motions of the object
+
+
+@dataclasses.dataclass(frozen=True)
+class Relations:
+    """Distinct motions of an object to a target, the best first.
+
+    Attributes:
+        target_contacts: poses X_t of the contact frame on the target, world frame, (solutions, 7).
+        object_contacts: poses X_o of the contact frame on the object as it lies, world frame, (solutions, 7).
+        energies: sum of the descriptor energies of both, (solutions,).
+        target_residual: residual of the best contact pose on the target; NaN if the target stands where it stood.
+    """
+
+    target_contacts: Float[np.ndarray, "solutions 7"]
+    object_contacts: Float[np.ndarray, "solutions 7"]
+    energies: Float[np.ndarray, " solutions"]
+    target_residual: float
+
+    @property
+    def motions(self) -> Float[Array, "solutions 7"]:
+        """Motions M of the object: a point x of it as it lies ends at M x."""
+        return se3.compose(jnp.asarray(self.target_contacts), se3.inverse(jnp.asarray(self.object_contacts)))
+
+
+@host
+def relate(
+    model: Model,
+    demonstration: Demonstration | Sequence[Demonstration] | Reference,
+    *,
+    points: Float[Array | np.ndarray, "points 3"],
+    target_points: Float[Array | np.ndarray, "target_points 3"] | None = None,
+    target_model: Model | None = None,
+    key: PRNGKeyArray,
+    config: CarryConfig = CarryConfig(),
+) -> Float[Array, "7"]:
+    """Find the motion that places a new object on a new target as in a demonstration, without a pick.
+
+    Args:
+        model: network of the object.
+        demonstration: one with a target, several with the same contact points, or a `Reference` from
+            `describe(..., target_model=...)`.
+        points: point cloud of the new object as it lies, (points, 3), metres, world frame.
+        target_points: point cloud of the new target, (points, 3), metres, world frame; None if the demonstrated target
+            stands where it stood.
+        target_model: network of the target; by default `model`.
+        key: random key; the result is a function of it.
+        config: settings of the search on both objects.
+
+    Returns:
+        The motion M of the object, `wxyz_xyz`, (7,), metres, world frame: a point x of it as it lies ends at M x.
+
+    Raises:
+        InputError: bad clouds, or a demonstration without a target.
+    """
+    checks.key("relate()", key)
+    reference = referenced("relate()", model, demonstration, target_points, target_model)
+    found = find_relations(
+        "relate()", encode(model, points), target_field(model, target_points, target_model), reference, key, config
+    )
+    return found.motions[0]
+
+
+def referenced(function: str, model: Model, demonstration, target_points, target_model: Model | None) -> Reference:
+    """The reference of a demonstration, with the target's side if there is a new target.
+
+    Raises:
+        InputError: a new target, or a network for it, without a demonstrated one.
+    """
+    if isinstance(demonstration, Reference):
+        reference = demonstration
+    else:
+        side = None if target_points is None else model if target_model is None else target_model
+        reference = describe(model, demonstration, target_model=side)
+    if reference.contact is None and (target_points is not None or target_model is not None):
+        raise InputError(
+            f"{function}: there is a target, and the demonstration has none; expected one with target=tdf.Target(...)"
+        )
+    if reference.contact is not None and target_points is not None and reference.contact.target_descriptors is None:
+        raise InputError(
+            f"{function}: there are target_points, and the reference does not have the target's descriptors; expected "
+            "describe(model, demonstration, target_model=...)"
+        )
+    return reference
+
+
+def target_field(model: Model, target_points, target_model: Model | None) -> DescriptorField | None:
+    """Field of the new target; None if the target stands where it stood."""
+    return None if target_points is None else encode(model if target_model is None else target_model, target_points)
+
+
+def find_relations(
+    function: str,
+    field: DescriptorField,
+    target: DescriptorField | None,
+    reference: Reference,
+    key: PRNGKeyArray,
+    config: CarryConfig,
+) -> Relations:
+    """Find the contact region on both objects, and combine what was found.
+
+    Args:
+        function: name that the messages begin with.
+        field: field of the new object as it lies.
+        target: field of the new target; None if it stands where it stood.
+        reference: the demonstration.
+        key: random key.
+        config: settings of the search.
+
+    Returns:
+        Every pair of a distinct pose on the target and one on the object, by the sum of their energies.
+
+    Raises:
+        InputError: the demonstration has no target, or nothing finite was found.
+    """
+    contact = reference.contact
+    if contact is None:
+        raise InputError(
+            f"{function}: the demonstration has no target; expected Demonstration(target=tdf.Target(...)), or a goal"
+        )
+    on_object, object_energies = _distinct(
+        function,
+        "object",
+        field,
+        contact.object_descriptors,
+        contact.T_object_contact,
+        contact,
+        jax.random.fold_in(key, OBJECT_STREAM),
+        config,
+    )
+    residual = np.nan
+    if target is None:
+        on_target, target_energies = np.asarray(contact.T_world_contact)[None], np.zeros(1, object_energies.dtype)
+    else:
+        if contact.target_descriptors is None or contact.T_target_contact is None:
+            raise InputError(f"{function}: the reference does not have the target's descriptors; see `describe`")
+        on_target, target_energies = _distinct(
+            function,
+            "target",
+            target,
+            contact.target_descriptors,
+            contact.T_target_contact,
+            contact,
+            jax.random.fold_in(key, TARGET_STREAM),
+            config,
+        )
+        residual = pick_residual(float(target_energies[0]), contact.target_descriptors)
+    energies = target_energies[:, None] + object_energies
+    rows, columns = np.unravel_index(np.argsort(energies, axis=None, kind="stable"), energies.shape)
+    return Relations(on_target[rows], on_object[columns], energies[rows, columns], residual)
+
+
+def _distinct(function, what, field, descriptors, T_origin_contact, contact: Contact, key, config: CarryConfig):
+    """Distinct poses of the contact frame in a field, and their energies, the best first."""
+    alone = Reference(descriptors[None], Trajectory(T_origin_contact[None]), contact.query)
+    found = solve(field, alone, key, fix_last=False, energy=EnergyWeights(0.0), config=config.solver)
+    modes = cluster_poses(jnp.asarray(found.picks), jnp.asarray(found.energies))
+    if not modes:
+        raise InputError(f"{function}: on the {what}, {found.status}; check its cloud and the contact points")
+    return np.stack([mode.pose for mode in modes]), np.array([mode.energy for mode in modes], np.float32)
+
+
+def carry_object(
+    field: DescriptorField,
+    target: DescriptorField | None,
+    reference: Reference,
+    key: PRNGKeyArray,
+    *,
+    config: CarryConfig = CarryConfig(),
+    progress: Callable[[int, Float[np.ndarray, " candidates"]], None] | None = None,
+    device_mesh: jax.sharding.Mesh | None = None,
+) -> Result:
+    """Find the pick and the motion of the object to the target, and warp the demonstrated path between them.
+
+    The pose at the release is M times the pick in every candidate, so that a change of the pick changes it.
+
+    Args:
+        field: field of the new object as it lies.
+        target: field of the new target; None if it stands where it stood.
+        reference: a demonstration with a target.
+        key: random key; the pick is that of `carry` with the same key.
+        config: settings of the search for the pick and for the contact region.
+        progress: see `solve`; of the pick.
+        device_mesh: see `solve`; for the pick.
+
+    Returns:
+        The result; its candidates are pairs of a pick and a motion, by the sum of their energies.
+
+    Raises:
+        InputError: as for `solve`, or the demonstration has no target.
+    """
+    relations = find_relations("imitate()", field, target, reference, key, config)
+    plain = dataclasses.replace(reference, approach=reference.approach[:0], retreat=reference.retreat[:0])
+    picked = carry(field, plain, key, fix_last=False, config=config, progress=progress, device_mesh=device_mesh)
+    picks, motions = np.asarray(picked.picks), np.asarray(relations.motions)
+    joint = np.where(np.asarray(picked.finite), np.asarray(picked.energies), np.inf)[:, None] + relations.energies
+    order = np.argsort(joint, axis=None, kind="stable")[:MAX_SOLUTIONS]
+    rows, columns = np.unravel_index(order, joint.shape)
+    trajectories = _carried(
+        _dense(reference.trajectory),
+        _released_contact(reference),
+        jnp.asarray(picks[rows]),
+        jnp.asarray(motions[columns]),
+        jnp.asarray(relations.target_contacts[columns]),
+    )
+    result = dataclasses.replace(
+        picked,
+        trajectories=trajectories,
+        energies=jnp.asarray(joint[rows, columns].astype(picked.energies.dtype)),
+        candidate_history=jnp.asarray(picked.candidate_history)[rows],
+        target_trajectories=jnp.asarray(relations.target_contacts[columns][:, None]),
+        target_residual=np.asarray(relations.target_residual, np.float32),
+    )
+    return with_ends(result, reference)
+
+
+def _dense(trajectory: Trajectory) -> Trajectory:
+    """The demonstrated path with poses at most `SPACING` apart."""
+    length = float(np.linalg.norm(np.diff(np.asarray(trajectory.translations), axis=0), axis=1).sum())
+    count = min(MAX_POSES, 1 + int(np.ceil(length / SPACING)))
+    return trajectory if count <= trajectory.num_poses else resample(trajectory, count)
+
+
+def _released_contact(reference: Reference) -> Float[Array, "7"]:
+    """Pose of the contact frame at the release in the frame of the reference's trajectory."""
+    poses, contact = jnp.asarray(reference.trajectory.wxyz_xyz), reference.contact
+    assert contact is not None  # `find_relations` has refused it
+    return se3.compose(se3.compose(poses[-1], se3.inverse(poses[0])), contact.T_object_contact)
+
+
+@jax.jit
+def _carried(path: Trajectory, released_contact, picks, motions, target_contacts):
+    def one(pick, motion, target_contact):
+        target_motion = se3.compose(target_contact, se3.inverse(released_contact))
+        return carry_to_target(path, pick, se3.compose(motion, pick), target_motion).wxyz_xyz
+
+    return jax.vmap(one)(picks, motions, target_contacts)
