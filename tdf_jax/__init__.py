@@ -6,8 +6,8 @@
     DescriptorField + Reference --carry, solve or optimize--> Result, whose `.trajectory` is the best one
     Trajectory + obstacles --push_clear--> Trajectory
 
-`imitate` goes the whole way in one call; with a `Target` it finds the goal on a second object. Lengths are in metres, angles in radians, poses `wxyz_xyz` as in jaxlie, and
-`T_world_query` is the pose of the query frame in the world.
+`imitate` goes the whole way in one call; with a `Target` it finds the goal on a second object. Lengths are in metres,
+angles in radians, poses `wxyz_xyz` as in jaxlie, and `T_world_query` is the pose of the query frame in the world.
 """
 
 from tdf_jax._internal.errors import (
