@@ -112,6 +112,7 @@ UNSUPPORTED = {
         np.random.default_rng(0).normal(size=(25, 30, 3)),
         r"\(25, 30, 3\), which may be several",
     ),
+    "few frames of a tracked cloud": (organised(12, 30), r"has shape \(12, 30, 3\), which may be several clouds"),
     "two cameras": (np.stack([organised()] * 2), r"has shape \(2, 30, 24, 3\)"),
     "triangles": (np.zeros((40, 3, 3)), r"has shape \(40, 3, 3\), which may be several clouds"),
     "matrices": (np.tile(np.eye(4), (40, 1, 1)), r"has shape \(40, 4, 4\)"),

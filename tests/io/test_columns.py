@@ -150,6 +150,10 @@ UNSUPPORTED = {
         text(before=(lambda i: str(i % 3),)),
         "numbers of the points or labels.*; expected x y z first; remove that",
     ),
+    "numbers from seven": (
+        text(before=(lambda i: str(i + 7),)),
+        "a first column of whole numbers, which may be numbers",
+    ),
     "numbers with gaps": (
         text(before=(lambda i: str(3 * i + 5),)),
         "a first column of whole numbers, which may be numbers",

@@ -102,10 +102,10 @@ def without_indices():
 
 def interleaved():
     builder = Builder()
-    rows = np.hstack([VERTICES, BOX.vertex_normals, np.zeros((8, 2))]).astype("<f4")
+    rows = np.hstack([BOX.vertex_normals, VERTICES, np.zeros((8, 2))]).astype("<f4")
     view = builder.view(rows.tobytes(), byteStride=32)
-    position = builder.accessor(VERTICES, bufferView=view)
-    normal = builder.accessor(VERTICES, bufferView=view, byteOffset=12)
+    normal = builder.accessor(VERTICES, bufferView=view)
+    position = builder.accessor(VERTICES, bufferView=view, byteOffset=12)
     index = builder.accessor(FACES.reshape(-1, 1), UBYTE)
     return builder.mesh({"attributes": {"POSITION": position, "NORMAL": normal}, "indices": index})
 

@@ -145,6 +145,7 @@ UNSUPPORTED = {
     V + faces() + "cstype bezier\nsurf 0 1 0 1 1 2 3 4\n": "has a free-form surface in line 22; expected polygons only",
     V + faces() + "call other.obj\n": "has another file in line 21",
     V.replace("\n", " 0.5\n") + faces(): "has vertices with a fourth number other than 1.*remove the fourth number",
+    V.replace("\n", " 0.5\n", 3) + faces(): "has vertices with a fourth number other than 1",
     V + "l 1 2\n": "has no faces, only lines; expected a surface",
     V.replace("v 3 0", "v 3,5 0.5") + faces(): "has numbers with commas as well as points",
 }

@@ -103,6 +103,18 @@ def test_an_l_is_read_in_every_layout(tmp_path, name, kind):
 
 
 @pytest.mark.parametrize("kind", FORMATS)
+def test_polygons_may_have_255_corners(tmp_path, kind):
+    """Beside a triangle, so that the rows differ in length."""
+    turn = np.linspace(0, 2 * np.pi, 256)[:-1]
+    vertices = [(np.cos(angle), np.sin(angle), 0.0) for angle in turn]
+    elements = [("vertex", XYZ, vertices), face(polygons=[list(range(255)), [2, 1, 0]])]
+    (tmp_path / "disc.ply").write_bytes(ply(kind, elements))
+    mesh = load_mesh(tmp_path / "disc.ply")
+    assert len(mesh.faces) == 254
+    assert mesh.area == pytest.approx(np.pi, rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
 def test_strips_are_read(tmp_path, kind):
     """A box of two strips, parted by -1, the second of which begins with a turn of its corner."""
     corners = [(x, y, z) for z in (0, 3) for y in (0, 2) for x in (0, 1)]

@@ -85,6 +85,7 @@ DAMAGED = {
     "header only": (b"\0" * 83, "has 83 bytes; a binary one has at least 84"),
     "text, no end": (text()[:-13], "truncated: 1 solids, of which not all have an endsolid"),
     "text, second has no end": (text() + text()[:200], "truncated: 2 solids"),
+    "text, first has no end": (text().replace("endsolid box\n", "") + text(), "truncated: 2 solids"),
     "text, open loop": (text().replace("endloop", "", 1), "without its words outer loop and endloop"),
     "text, two numbers": (text().replace("vertex 0.5 1 1.5", "vertex 0.5 1", 1), "a vertex that is not three numbers"),
     "text, a word": (text().replace("vertex 0.5", "vertex a", 1), "'a' is no number"),
