@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -66,6 +65,7 @@ class Landscape:
         for name, expected in (("waypoints", (len(self.waypoints), 3)), ("rotations", (len(self.rotations), 3, 3))):
             if np.shape(getattr(self, name)) != expected:
                 raise InputError(f"Landscape(): {name} have shape {getattr(self, name).shape}; expected {expected}")
+        checks.rotations("Landscape()", "rotations", self.rotations)
         if self.turned is not None:
             _check_turned(self.turned, shape, len(self.rotations))
 
@@ -235,7 +235,7 @@ def load_landscape(path: str | os.PathLike) -> tuple[Landscape, dict]:
 
 
 def _npz(function, path):
-    path = Path(path)
+    path = checks.path(f"{function}()", path)
     if path.suffix != ".npz":
         raise InputError(f"{function}(): the file is {path}; expected a name that ends in .npz")
     return path

@@ -78,7 +78,7 @@ def restore(directory: Path, params, state) -> tuple:
 def metrics(directory: Path) -> list[dict]:
     """The rows of a run's metrics, without a line that is damaged or that an interruption cut short."""
     path = directory / METRICS
-    rows = (_row(line) for line in path.read_text().splitlines()) if path.exists() else ()
+    rows = (_row(line) for line in path.read_text(errors="replace").splitlines()) if path.exists() else ()
     return [row for row in rows if row is not None]
 
 

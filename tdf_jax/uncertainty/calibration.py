@@ -50,7 +50,13 @@ def confidence(residual: float, intercept: float = INTERCEPT, slope: float = SLO
 
     Returns:
         The probability, in [0, 0.99]; None if the residual is not finite.
+
+    Raises:
+        InputError: an argument is not one number, or the curve is not finite.
     """
+    residual = _number("confidence()", "residual", residual)
+    checks.number("confidence()", "intercept", intercept)
+    checks.number("confidence()", "slope", slope)
     if not np.isfinite(residual):
         return None
     return min(MAX_CONFIDENCE, float(1 / (1 + np.exp(slope * np.log(max(residual, 1e-9)) - intercept))))
@@ -210,10 +216,19 @@ def recognition(
         The probability, in [0, 1]; None if the residual or the logit is not finite.
 
     Raises:
-        InputError: the curve is not three finite numbers.
+        InputError: the residual or the logit is not one number, or the curve is not three finite numbers.
     """
     coefficients = checks.vector("recognition()", "curve", curve, unit="")
+    residual = _number("recognition()", "residual", residual)
+    surface_logit = _number("recognition()", "surface_logit", surface_logit)
     if not np.isfinite([residual, surface_logit]).all():
         return None
     exponent = np.dot(coefficients, (1.0, -np.log(max(residual, 1e-9)), surface_logit))
     return float(1 / (1 + np.exp(-np.clip(exponent, -50, 50))))
+
+
+def _number(function: str, name: str, value: float) -> float:
+    """One number, which need not be finite."""
+    if np.ndim(value) != 0 or np.asarray(value).dtype.kind not in "fiu":
+        raise InputError(f"{function}: {name} is {value!r}; expected one number")
+    return float(value)

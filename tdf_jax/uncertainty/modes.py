@@ -72,6 +72,10 @@ def cluster_poses(
             f"cluster_poses(): poses have shape {poses.shape} and energies {values.shape}; expected (candidates, 7) "
             "and (candidates,). Take one waypoint of each candidate, such as result.trajectories[:, 0]"
         )
+    if poses.dtype.kind not in "fiu" or values.dtype.kind not in "fiu":
+        raise InputError(
+            f"cluster_poses(): poses have type {poses.dtype} and energies {values.dtype}; expected numbers"
+        )
     checks.number("cluster_poses()", "angle", angle, least=0, unit="radians")
     checks.number("cluster_poses()", "distance", distance, least=0, unit="metres")
     finite = np.flatnonzero(np.isfinite(values) & np.isfinite(poses).all(axis=1))

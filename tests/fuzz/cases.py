@@ -106,7 +106,7 @@ def _judged(case, caught):
 
 FUNCTION = re.compile(r"(tdf( [a-z]+)?|[A-Za-z_.]+\(\))[: ]")
 FIX = re.compile(
-    r"\b(expected|use|save|check|give|drop|remove|multiply|subtract|copy|choose|delete|invert|add|re-save|run|rename|train|convert|compute|correct|"
+    r"\b(expected|use|save|check|give|drop|remove|multiply|subtract|copy|choose|delete|invert|add|re-save|run|rename|train|convert|compute|correct|lower|raise|move|reduce|keep|"
     r"repair|divide|free|write|put|transpose|restore)\b",
     re.IGNORECASE,
 )

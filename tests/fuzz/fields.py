@@ -163,7 +163,6 @@ def imitate_case(rng, world: World, folder) -> Case:
             ("fix_last", "no"),
             ("fix_last", None),
             ("device_mesh", 3),
-            ("progress", 3),
         ]
         name, value = one_of(rng, options)
         arguments[name] = value

@@ -321,6 +321,8 @@ def leaves(value):
         value = list(value.values())
     if hasattr(value, "triangles") and hasattr(value, "vertices"):  # a mesh
         value = [np.asarray(value.triangles)]
+    if isinstance(value, list) and value and all(isinstance(row, list) for row in value):  # an array as it was given
+        value = np.asarray(value)
     if isinstance(value, list | tuple):
         return [leaf for item in value for leaf in leaves(item)]
     if value is None or isinstance(value, str | bool) or callable(value):
