@@ -55,11 +55,11 @@ def test_every_variant_is_one_closed_container_that_stands_on_its_base(name):
 def test_contains_agrees_with_the_winding_number_of_the_mesh(name):
     container, rng = build_container(VARIANTS[name]), np.random.default_rng(0)
     low, high = container.mesh.bounds
-    surface, normals = surface_samples(container.mesh, rng, 150)
-    away = rng.choice([-1, 1], 150)[:, None] * rng.uniform(1e-5, 2e-3, (150, 1)) * normals
-    points = np.concatenate([rng.uniform(low - 0.005, high + 0.005, (50, 3)), surface + away])
+    surface, normals = surface_samples(container.mesh, rng, 80)
+    away = rng.choice([-1, 1], 80)[:, None] * rng.uniform(1e-5, 2e-3, (80, 1)) * normals
+    points = np.concatenate([rng.uniform(low - 0.005, high + 0.005, (20, 3)), surface + away])
     inside = winding_numbers(container.mesh, points) > 0.5
-    assert 40 < inside.sum() < 160
+    assert 20 < inside.sum() < 80
     np.testing.assert_array_equal(container.contains(points), inside)
 
 

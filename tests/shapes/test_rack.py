@@ -1,14 +1,16 @@
 """The rack family: closed meshes of given dimensions, pegs and their seats, and the range of sampled dimensions."""
 
 from dataclasses import replace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from test_mug import surface_samples, winding_numbers
 
 from tdf_jax._internal.errors import InputError
-from tdf_jax.shapes import Rack, RackParameters, build_rack, sample_rack, scaled
+from tdf_jax.geometry.sampling import sample_surface
+from tdf_jax.shapes import Rack, RackParameters, build_mug, build_rack, sample_mug, sample_rack, scaled
 
 PLAIN = RackParameters()
 VARIANTS = {
@@ -51,11 +53,11 @@ def test_every_variant_is_one_closed_rack_that_stands_on_its_base(name):
 def test_contains_agrees_with_the_winding_number_of_the_mesh(name):
     rack, rng = build_rack(VARIANTS[name]), np.random.default_rng(0)
     low, high = rack.mesh.bounds
-    surface, normals = surface_samples(rack.mesh, rng, 150)
-    away = rng.choice([-1, 1], 150)[:, None] * rng.uniform(1e-5, 2e-3, (150, 1)) * normals
-    points = np.concatenate([rng.uniform(low - 0.005, high + 0.005, (50, 3)), surface + away])
+    surface, normals = surface_samples(rack.mesh, rng, 80)
+    away = rng.choice([-1, 1], 80)[:, None] * rng.uniform(1e-5, 2e-3, (80, 1)) * normals
+    points = np.concatenate([rng.uniform(low - 0.005, high + 0.005, (20, 3)), surface + away])
     inside = winding_numbers(rack.mesh, points) > 0.5
-    assert 40 < inside.sum() < 160
+    assert 20 < inside.sum() < 80
     np.testing.assert_array_equal(rack.contains(points), inside)
 
 
@@ -176,6 +178,48 @@ def test_sampled_racks_are_built():
 @pytest.mark.slow
 def test_many_sampled_racks_are_built():
     assert_sampled_racks(range(12, 400))
+
+
+# ---- mugs on pegs ----
+
+
+def finger_hole(mug, step=5e-4):
+    """Diameter of the largest circle in a mug's finger hole, in its plane of symmetry, metres."""
+    low, high = mug.mesh.bounds + np.array([[-0.005], [0.005]])
+    x, z = np.arange(low[0], high[0], step), np.arange(low[2], high[2], step)
+    plane = np.stack(np.meshgrid(x, [0.0], z, indexing="ij"), axis=-1)
+    labelled: Any = ndimage.label(~mug.contains(plane.reshape(-1, 3)).reshape(len(x), len(z)))
+    parts, count = labelled
+    enclosed = [parts == part for part in range(1, count + 1) if part != parts[0, 0]]
+    return max(2 * step * np.max(np.asarray(ndimage.distance_transform_edt(part))) for part in enclosed)
+
+
+def hangs(mug, rack, peg, rng):
+    """Whether a mug hangs somewhere on a peg without touching more: its handle above the peg and across it."""
+    T, (begin, tip) = rack.peg_frames[peg], rack.peg_lines[peg]
+    grip = mug.handle_frame[:3, 3] - [mug.parameters.handle_thickness / 2, 0, 0]  # the handle's inner side
+    ours, theirs = sample_surface(mug.mesh, 1000, rng), sample_surface(rack.mesh, 2000, rng)
+    for along_peg, across in ((T[:3, 0], T[:3, 1]), (-T[:3, 0], -T[:3, 1])):
+        R = np.stack([T[:3, 2], along_peg, -across], axis=1)  # the handle up, and the mug's axis across the peg
+        for share in np.linspace(0.4, -0.35, 8):
+            for lift in (3e-4, 1.5e-3):  # a flared handle is thicker beside its grip
+                t = T[:3, 3] + share * (tip - begin) + lift * T[:3, 2] - R @ grip
+                placed = ours @ R.T + t
+                standing = placed[:, 2].min() > -rack.height / 2
+                if standing and not rack.contains(placed).any() and not mug.contains((theirs - t) @ R).any():
+                    return True
+    return False
+
+
+@pytest.mark.slow
+def test_most_sampled_mugs_hang_on_sampled_racks():
+    rng, hung = np.random.default_rng(0), []
+    for seed in range(60):
+        mug = build_mug(sample_mug(np.random.default_rng([1, seed])))
+        rack = build_rack(sample_rack(np.random.default_rng([2, seed])))
+        assert finger_hole(mug) > rack.parameters.peg_thickness
+        hung.append(any(hangs(mug, rack, peg, rng) for peg in range(rack.parameters.pegs)))
+    assert np.mean(hung) >= 0.8
 
 
 # ---- bad input ----
