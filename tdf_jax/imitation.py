@@ -95,6 +95,7 @@ def imitate(
             "imitate(): energy is given, but `carry` does not minimise eq. 3; expected no energy, or "
             "config=SolveConfig() or OptimizeConfig() with it"
         )
+    checks.boolean("imitate()", "fix_last", fix_last)
     reference = referenced("imitate()", model, demonstration, target_points, target_model)
     if reference.contact is not None:
         given = {"goal": goal is not None, "goal_offset": goal_offset is not None, "fix_last=False": not fix_last}

@@ -5,7 +5,9 @@ value, in the type that the caller wants. Shapes are checked of traced values to
 ones through, because they are not known yet.
 """
 
+import os
 from collections.abc import Collection
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -24,6 +26,7 @@ FARTHEST = 250.0
 SMALLEST_IN_MILLIMETRES = 10.0  # extent of a cloud above which its numbers are probably millimetres
 UNIT_NORM = 1e-3  # largest deviation of a quaternion's norm from 1: rounding to three decimals, or to float16
 SENTINEL_SHARE = 0.01  # share of the rows that may have one value, where other values are not as common
+MOST = 2**32 - 1  # largest count: array sizes and loop lengths beyond have no memory, and XLA fails without a message
 MINIMUM_POINTS = 21  # the encoder's 20 nearest neighbours, the point itself included, and one to choose from
 
 
@@ -34,8 +37,9 @@ def traced(*values) -> bool:
 
 def count(function: str, name: str, value, least: int = 1, most: float = np.inf) -> int:
     """Check that a value is a whole number from `least` to `most`; return it."""
-    if not _is_whole(value) or not least <= value <= most:
-        expected = f"of at least {least}" if most == np.inf else f"from {least} to {most}"
+    if not _is_whole(value) or not least <= value <= min(most, MOST):
+        bounded = most < np.inf or (_is_whole(value) and value > MOST)
+        expected = f"from {least} to {min(most, MOST)}" if bounded else f"of at least {least}"
         raise InputError(f"{function}: {name} is {value!r}; expected a whole number {expected}")
     return int(value)
 
@@ -89,9 +93,38 @@ def choice(function: str, name: str, value, choices: Collection[str] | Collectio
     return value
 
 
+def path(function: str, value, name: str = "path") -> Path:
+    """Check that a value can be the path of a file or a folder; return it."""
+    if not isinstance(value, str | os.PathLike):
+        raise InputError(f"{function}: {name} is {value!r}; expected a path, text or a pathlib.Path")
+    path = Path(value)
+    if "\0" in str(path):
+        raise InputError(f"{function}: {name} {str(path)!r} has a zero byte; expected a name that a file can have")
+    return path
+
+
+def existing_file(function: str, value, expected: str = "an existing file; check the path") -> Path:
+    """Check that a value is the path of an existing file; return it."""
+    file = path(function, value)
+    try:
+        exists = file.is_file()
+    except (OSError, ValueError):  # such as a name that is too long
+        exists = False
+    if not exists:
+        raise InputError(f"{function}: there is no file {file}; expected {expected}")
+    return file
+
+
+def boolean(function: str, name: str, value) -> bool:
+    """Check that a value is True or False; return it."""
+    if not isinstance(value, bool | np.bool_):
+        raise InputError(f"{function}: {name} is {value!r}; expected True or False")
+    return bool(value)
+
+
 def vector(function: str, name: str, value: ArrayLike, size: int = 3, unit: str = "metres") -> np.ndarray | jax.Array:
     """Check that a value is `size` finite numbers; return them, as float64 unless they are traced."""
-    vector = jnp.asarray(value) if traced(value) else _array(function, name, value)
+    vector = jnp.asarray(value) if traced(value) else numbers(function, name, value)
     if vector.shape != (size,) or not (traced(vector) or np.isfinite(vector).all()):
         raise InputError(
             f"{function}: {name} is {value}; expected {_in_words(size)} finite numbers{unit and ', ' + unit}"
@@ -109,7 +142,7 @@ def direction(function: str, name: str, value: ArrayLike) -> np.ndarray | jax.Ar
 
 def lengths(function: str, name: str, value: ArrayLike, size: int = 3) -> np.ndarray | jax.Array:
     """Check that a value is `size` lengths above 0, metres; return them, as float64 unless they are traced."""
-    lengths = jnp.asarray(value) if traced(value) else _array(function, name, value)
+    lengths = jnp.asarray(value) if traced(value) else numbers(function, name, value)
     if lengths.shape != (size,) or not (traced(lengths) or (np.isfinite(lengths) & (lengths > 0)).all()):
         raise InputError(f"{function}: {name} is {value}; expected {_in_words(size)} lengths above 0, metres")
     return lengths
@@ -141,7 +174,7 @@ def pose(function: str, name: str, value: ArrayLike) -> ArrayLike:
     if np.shape(value) != (7,):
         raise InputError(f"{function}: {name} has shape {np.shape(value)}; expected one pose wxyz_xyz, (7,)")
     if not traced(value):
-        values = _array(function, name, value)
+        values = numbers(function, name, value)
         if not np.isfinite(values).all():
             raise InputError(f"{function}: {name} is {values.tolist()}; expected one finite pose wxyz_xyz")
         unit_quaternions(function, name, values[None])
@@ -201,15 +234,18 @@ def rotations(function: str, name: str, value: ArrayLike) -> ArrayLike:
     if np.shape(value)[-2:] != (3, 3):
         raise InputError(f"{function}: {name} has shape {np.shape(value)}; expected rotation matrices, (..., 3, 3)")
     if not traced(value):
-        R = _array(function, name, value)
+        R = numbers(function, name, value)
         if not (np.allclose(R @ np.swapaxes(R, -1, -2), np.eye(3), atol=1e-3) and (np.linalg.det(R) > 0).all()):
-            raise InputError(f"{function}: {name} is not orthonormal with determinant 1, or not finite")
+            raise InputError(
+                f"{function}: {name} is not orthonormal with determinant 1, or not finite; expected rotation matrices. "
+                "Divide by a scale, and check the order of rows and columns"
+            )
     return value
 
 
 def orientation(function: str, name: str, value: ArrayLike) -> np.ndarray | jax.Array:
     """Check that a value is a matrix (3, 3) or a quaternion wxyz (4,); return it, as float64 unless it is traced."""
-    orientation = jnp.asarray(value) if traced(value) else _array(function, name, value)
+    orientation = jnp.asarray(value) if traced(value) else numbers(function, name, value)
     if orientation.shape not in {(3, 3), (4,)}:
         raise InputError(f"{function}: {name} has shape {orientation.shape}; expected (3, 3), or (4,) as wxyz")
     if orientation.shape == (3, 3):
@@ -331,8 +367,11 @@ def query(function: str, value) -> ArrayLike:
         raise InputError(
             f"{function}: query points have shape {shape}; expected (queries, 3). Try tdf.box_query(key, count=500)"
         )
-    if not traced(value) and not np.isfinite(np.asarray(value)).all():
-        raise InputError(f"{function}: some query points are NaN or infinite; expected finite metres")
+    if not traced(value):
+        if np.asarray(value).dtype.kind not in "fiu" and not jnp.issubdtype(np.asarray(value).dtype, np.floating):
+            raise InputError(f"{function}: query points are {np.asarray(value).dtype}; expected numbers, metres")
+        if not np.isfinite(np.asarray(value)).all():
+            raise InputError(f"{function}: some query points are NaN or infinite; expected finite metres")
     return value
 
 
@@ -348,8 +387,8 @@ def _is_number(value) -> bool:
     if isinstance(value, bool | np.bool_) or np.ndim(value) != 0:
         return False
     try:
-        return bool(np.isfinite(value))
-    except TypeError:
+        return np.asarray(value).dtype.kind in "fiu" and bool(np.isfinite(value))
+    except (TypeError, OverflowError):  # not a number, or an integer of more than 64 bits
         return False
 
 
@@ -359,8 +398,12 @@ def _scalar(function, name, value):
     return value
 
 
-def _array(function, name, value) -> np.ndarray:
+def numbers(function: str, name: str, value) -> np.ndarray:
+    """Check that a value is an array of real numbers; return it as float64."""
     try:
-        return np.asarray(plain_array(function, name, value), dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{function}: {name} is {value!r}; expected numbers") from None
+        array = plain_array(function, name, value)
+        if array.dtype.kind in "cmM":  # complex numbers and dates would become other numbers
+            raise TypeError
+        return np.asarray(array, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{function}: {name} is {value!r}; expected real numbers") from None

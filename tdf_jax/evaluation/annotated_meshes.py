@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.axis_profiles import profile, profile_places
 from tdf_jax.evaluation.mesh_folder import deeper, file_names, is_mesh, warn_of_deeper
@@ -95,7 +96,7 @@ def load_annotated(folder: str | Path, recursive: bool = False) -> list[Annotate
         InputError: the folder or the sidecar is missing, an entry is malformed or names a mesh that cannot be used, or
             a mesh lies in the folder without an entry.
     """
-    folder = Path(folder)
+    folder = checks.path("load_annotated()", folder, "folder")
     entries = _entries(folder, recursive)
     return [_annotated(folder / name, name, entries[name]) for name in sorted(entries)]
 

@@ -31,6 +31,7 @@ def thin(points: Float[np.ndarray, "points 3"], count: int) -> Float[np.ndarray,
     Raises:
         InputError: count is below 1, the shape is not (points, 3), or a point is not finite.
     """
+    points = checks.plain_array("thin()", "points", points)
     indices = farthest_point_indices(points, count)
     return points if len(indices) == len(points) else points[indices]
 
@@ -52,7 +53,7 @@ def drop_invalid(points: Float[np.ndarray, "*grid 3"]) -> Float[np.ndarray, "poi
     Raises:
         InputError: the shape is wrong, these are no numbers, or no row is a measurement.
     """
-    cloud = np.asarray(points)
+    cloud = checks.plain_array("drop_invalid()", "points", points)
     if cloud.ndim not in (2, 3) or cloud.shape[-1] != 3 or cloud.dtype.kind not in "fiu":
         raise InputError(
             f"drop_invalid(): points have shape {cloud.shape} and dtype {cloud.dtype}; expected numbers, (points, 3) "

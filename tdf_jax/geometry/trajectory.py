@@ -75,7 +75,12 @@ class Trajectory:
         Raises:
             InputError: the shape is wrong, or a matrix is not rigid or not finite.
         """
-        T = jnp.asarray(T_world_query)
+        T = (
+            T_world_query
+            if checks.traced(T_world_query)
+            else checks.numbers("Trajectory.from_matrices()", "T_world_query", T_world_query)
+        )
+        T = jnp.asarray(T)
         if T.ndim != 3 or T.shape[1:] != (4, 4):
             raise InputError(f"Trajectory.from_matrices(): matrices have shape {T.shape}; expected (poses, 4, 4)")
         if not checks.traced(T):
@@ -142,6 +147,11 @@ def check_trajectory(trajectory: Trajectory, name: str = "trajectory") -> Trajec
         InputError: the shape is not (poses, 7) with at least one pose, a number is not finite, or the norm of a
             quaternion differs from 1 by more than 1e-3, as in arrays of another order.
     """
+    if not isinstance(trajectory, Trajectory):
+        raise InputError(
+            f"check_trajectory(): {name} is a {type(trajectory).__name__}; expected a Trajectory, as of tdf.wave() or "
+            "tdf.Trajectory(wxyz_xyz) of an array (poses, 7)"
+        )
     wxyz_xyz = trajectory.wxyz_xyz
     if not isinstance(wxyz_xyz, jax.Array | np.ndarray) or is_foreign(wxyz_xyz):
         raise InputError(f"check_trajectory(): {name}.wxyz_xyz is a {type(wxyz_xyz).__name__}; expected an array")

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import public
 from tdf_jax.geometry import se3
-from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.geometry.trajectory import Trajectory, check_trajectory
 
 # Metres of the path that repeat the demonstration after the pick and before the goal.
 DEPARTURE, ARRIVAL = 0.05, 0.08
@@ -33,6 +33,7 @@ def carry_trajectory(demonstrated: Trajectory, pick: Float[Array, "7"], goal: Fl
     Raises:
         InputError: the pick or the goal is not one finite pose.
     """
+    check_trajectory(demonstrated, "demonstrated")
     pick = jnp.asarray(checks.pose("carry_trajectory()", "pick", pick))
     if goal is not None:
         goal = jnp.asarray(checks.pose("carry_trajectory()", "goal", goal))

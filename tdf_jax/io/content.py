@@ -55,11 +55,10 @@ def existing_file(function: str, path: str | Path, suffixes: tuple[str, ...], sc
     Raises:
         InputError: the suffix is unknown, the file is missing, or scale is not above 0.
     """
-    path = Path(path)
+    path = checks.path(function, path)
     if path.suffix.lower() not in suffixes:
         raise InputError(f"{function}: {path} has suffix {path.suffix!r}; expected one of {', '.join(suffixes)}")
-    if not path.is_file():
-        raise InputError(f"{function}: there is no file {path}; expected an existing file; check the path")
+    checks.existing_file(function, path)
     checks.positive(function, "scale", scale, "metres per unit of the file")
     return path
 

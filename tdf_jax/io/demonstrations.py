@@ -7,6 +7,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import public
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
@@ -79,8 +80,7 @@ def load_demonstration(path: str | os.PathLike) -> Demonstration:
             demonstration, or its unit or frames are wrong.
     """
     path = _npz("load_demonstration()", path)
-    if not path.is_file():
-        raise InputError(f"load_demonstration(): there is no file {path}; check the path")
+    checks.existing_file("load_demonstration()", path)
     try:
         with path.open("rb") as file, np.lib.npyio.NpzFile(file, allow_pickle=False) as archive:
             names = (*ARRAYS, *INDICES, *TARGET_ARRAYS, "schema")
@@ -181,7 +181,7 @@ def _gap(points: np.ndarray, wxyz_xyz: np.ndarray, query: np.ndarray) -> float:
 
 
 def _npz(function: str, path: str | os.PathLike) -> Path:
-    path = Path(path)
+    path = checks.path(function, path)
     if path.suffix != ".npz":
         raise InputError(f"{function}: {path} has suffix {path.suffix!r}; expected .npz")
     return path

@@ -50,6 +50,7 @@ def load_points(
     path = existing_file(function, path, MESH_SUFFIXES + CLOUD_SUFFIXES, scale)
     if count is not None:
         checks.count(function, "count", count)
+    checks.seed(function, seed)
     rng = np.random.default_rng(seed)
     if path.suffix.lower() in MESH_SUFFIXES:
         points, faces = read_surface(function, path)

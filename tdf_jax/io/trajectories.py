@@ -57,8 +57,7 @@ def load_trajectory(path: str | Path) -> Trajectory:
             are farther from the origin than float32 resolves.
     """
     path = _known_suffix("load_trajectory()", path, tuple(_READERS))
-    if not path.is_file():
-        raise InputError(f"load_trajectory(): there is no file {path}; expected an existing file; check the path")
+    checks.existing_file("load_trajectory()", path)
     try:
         wxyz_xyz = _READERS[path.suffix.lower()](path)
     except _Dialect as reason:
@@ -127,7 +126,7 @@ _READERS = {".npz": _read_npz, ".tum": _read_tum, ".csv": _read_csv}
 
 
 def _known_suffix(function: str, path: str | Path, suffixes: tuple[str, ...]) -> Path:
-    path = Path(path)
+    path = checks.path(function, path)
     if path.suffix.lower() not in suffixes:
         raise InputError(f"{function}: {path} has suffix {path.suffix!r}; expected {' or '.join(suffixes)}")
     return path

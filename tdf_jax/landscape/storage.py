@@ -200,6 +200,8 @@ def load_landscape(path: str | os.PathLike) -> tuple[Landscape, dict]:
     """
     path = _npz("load_landscape", path)
     try:
+        if path.exists() and not path.is_file():  # a pipe would wait for a writer
+            raise OSError("it is no file")
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         header = json.loads(str(arrays.pop("header")))

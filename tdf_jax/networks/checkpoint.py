@@ -16,6 +16,7 @@ import safetensors
 import safetensors.numpy
 from flax.traverse_util import flatten_dict, unflatten_dict
 
+from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import public
 from tdf_jax._internal.cache import digest
 from tdf_jax._internal.errors import InputError
@@ -52,7 +53,7 @@ def save_model(model: Model, path: str | os.PathLike) -> None:
     Raises:
         InputError: the path cannot be written, or the parameters do not fit the model's config or are not finite.
     """
-    target = Path(path)
+    target = checks.path("save_model()", path)
     if target.suffix != SUFFIX:
         raise InputError(f"save_model(): got the path {target}; expected one that ends in {SUFFIX}")
     # safetensors writes memory in its own order, so it would scramble a transposed view.
@@ -141,7 +142,7 @@ def _editable_checkout() -> Path | None:
 
 
 def _locate(name_or_path: str | os.PathLike) -> Path:
-    path, shipped = Path(name_or_path), _shipped()
+    path, shipped = checks.path("load_model()", name_or_path, "the name or path"), _shipped()
     names = ", ".join(shipped) or "none"
     is_name = not path.suffix and str(name_or_path) == path.name
     if is_name and path.name not in shipped:

@@ -60,6 +60,8 @@ def encode(
     Warns:
         SizeWarning: the cloud is far smaller or larger than the objects that the network was trained on.
     """
+    if not isinstance(model, Model):
+        raise InputError(f"encode(): model is {model!r}; expected a Model, such as tdf.load_model('mug')")
     cloud, density = checks.points("encode()", points), model.info.cloud_points
     num_subsamples = checks.count("encode()", "num_subsamples", num_subsamples, 0)
     if len(cloud) < model.config.neighbours:

@@ -9,11 +9,11 @@ import dataclasses
 import os
 import statistics
 from collections.abc import Mapping
-from pathlib import Path
 
 import jax.numpy as jnp
 from flax.traverse_util import unflatten_dict
 
+from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import public
 from tdf_jax._internal.errors import InputError
 from tdf_jax.networks.model import NDF_SIZES, Model, ModelInfo, shape_problems, value_problems
@@ -47,7 +47,7 @@ def convert_checkpoint(path: str | os.PathLike, name: str | None = None, prefix:
         InputError: the file is of another kind or damaged, holds no such network or several, or the network is of
             another architecture.
     """
-    path = Path(path)
+    path = checks.path("convert_checkpoint()", path)
     try:
         with opened(path) as file:
             config, params = _convert(file, prefix)

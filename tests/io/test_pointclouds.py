@@ -338,7 +338,7 @@ BAD_POINTS = {
     "has dtype complex64": CLOUD.astype(np.complex64),
     "has dtype bool": CLOUD > 0,
     "has dtype <U1": np.full((30, 3), "a"),
-    "is not an array of numbers": [[1, 2, 3], [4, 5]],
+    "that cannot be read as an array": [[1, 2, 3], [4, 5]],
 }
 
 
