@@ -71,7 +71,8 @@ def calls(world: World) -> dict[str, Callable[[], Call]]:
         "confidence": (residuals | {"intercept": 3.0, "slope": -2.0}, ()),
         "recognition": (residuals | {"surface_logit": 1.0, "curve": [1.0, 2.0, 3.0]}, ()),
         "lowest_cost_path": (
-            {"landscape": world.landscape, "start": [0.25, -0.25, 0.1], "goal": [0.35, -0.15, 0.1], "sharpness": 1.0}, ()
+            {"landscape": world.landscape, "start": [0.25, -0.25, 0.1], "goal": [0.35, -0.15, 0.1],
+            "sharpness": 1.0}, ()
         ),
         "Trajectory.from_matrices": ({"T_world_query": np.tile(np.eye(4), (4, 1, 1))}, ()),
         "Demonstration": ({"points": CLOUD, "trajectory": trajectory, "query": query, "grasp": 0, "release": -1}, ()),
@@ -79,8 +80,10 @@ def calls(world: World) -> dict[str, Callable[[], Call]]:
             {"origin": np.zeros(3), "directions": np.eye(3)[:2], "coordinates": (np.arange(3.0), np.arange(4.0)),
              "mask": np.ones((3, 4), bool)}, ("mask",)
         ),
-        "EnergyWeights": ({"correlation": 0.02, "compensator": 0.0, "rotation_scale": 1.0, "pose_norm": "frobenius"}, ()),
-        "CarryConfig": ({"num_starts": 8, "num_candidates": 3, "coarse_steps": 2, "start": "uniform", "tolerance": 0.1}, ()),
+        "EnergyWeights": ({"correlation": 0.02, "compensator": 0.0, "rotation_scale": 1.0,
+        "pose_norm": "frobenius"}, ()),
+        "CarryConfig": ({"num_starts": 8, "num_candidates": 3, "coarse_steps": 2, "start": "uniform",
+        "tolerance": 0.1}, ()),
         "SolveConfig": ({"num_starts": 8, "num_candidates": 3, "refine_steps": 2, "tolerance": 0.1}, ()),
         "OptimizeConfig": ({"num_starts": 3, "iterations": 2, "rotation_rate": 0.01, "translation_rate": 0.01}, ()),
         "ClearanceConfig": ({"rotation_scale": 0.1, "deviation": 0.1, "iterations": 10}, ()),
@@ -189,6 +192,8 @@ def argument_case(rng, world: World, folder) -> Case:
     text, odd, refused = hostile(rng, argument, value, argument in call.optional)
     act = lambda: call.function(**{**call.arguments, argument: odd})  # noqa: E731
     told = f"{name}({argument}={text})"
+    if name == "drop_invalid" and text in {"a number that is not finite", "one more axis"}:  # what it is for
+        refused = None
     if refused in (False, "same"):
         expected = leaves(call.function(**call.arguments))
 

@@ -49,7 +49,8 @@ def run_library(seed: int, number: int, world: World) -> dict:
         shutil.rmtree(folder, ignore_errors=True)
     seconds = round(time.perf_counter() - began, 3)
     happened = happened.replace(str(folder), "FOLDER")
-    return {"case": number, "kind": case.kind, "text": case.text, "verdict": verdict, "happened": happened, "seconds": seconds}  # fmt: skip
+    return {"case": number, "kind": case.kind, "text": case.text, "verdict": verdict, "happened": happened,
+    "seconds": seconds}  # fmt: skip
 
 
 def run_command(seed: int, number: int, world: World) -> dict:
@@ -63,7 +64,8 @@ def run_command(seed: int, number: int, world: World) -> dict:
         shutil.rmtree(folder, ignore_errors=True)
     seconds = round(time.perf_counter() - began, 3)
     happened = happened.replace(str(folder), "FOLDER")
-    return {"case": number, "kind": case.kind, "text": case.text, "verdict": verdict, "happened": happened, "seconds": seconds}  # fmt: skip
+    return {"case": number, "kind": case.kind, "text": case.text, "verdict": verdict, "happened": happened,
+    "seconds": seconds}  # fmt: skip
 
 
 RUNS = {"library": run_library, "commands": run_command}
@@ -169,6 +171,7 @@ def main() -> int:
     parser.add_argument("--commands", type=int, default=None, help="cases of the command line; by default 3 in 100")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("runs/fuzz"), help="folder of the verdicts; a rerun goes on")
+    parser.add_argument("--again", action="store_true", help="forget bad verdicts, and try these cases again")
     parser.add_argument("--only", help="beginning of the kind of cases to run, in this process")
     parser.add_argument("--case", type=int, help="run this case only, and print what happened")
     parser.add_argument("--worker", choices=RUNS, help="with --case: which cases the number is of")
@@ -190,6 +193,9 @@ def main() -> int:
     if (out / "settings.json").exists() and json.loads((out / "settings.json").read_text()) != settings:
         raise SystemExit(f"{out} holds a campaign with another seed; choose another --out")
     (out / "settings.json").write_text(json.dumps(settings))
+    for log in out.glob("*.jsonl") if given.again else ():
+        kept = [row for row in rows(log) if row["verdict"] != BAD]
+        log.write_text("".join(json.dumps(row) + "\n" for row in kept))
     numbers = {"library": given.cases, "commands": 3 * given.cases // 100 if given.commands is None else given.commands}
     everything = []
     for part, number in numbers.items():

@@ -51,7 +51,7 @@ class Hang(BaseException):
 
 def patience() -> float:
     """Seconds after which a case hangs, on a machine that is as busy as this one."""
-    return SECONDS * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+    return SECONDS * min(3.0, max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1)))
 
 
 def judge(case: Case, folder: Path) -> tuple[str, str]:
@@ -105,11 +105,11 @@ def _judged(case, caught):
 
 
 FUNCTION = re.compile(r"(tdf( [a-z]+)?|[A-Za-z_.]+\(\))[: ]")
-FIX = re.compile(
-    r"\b(expected|use|save|check|give|drop|remove|multiply|subtract|copy|choose|delete|invert|add|re-save|run|rename|train|convert|compute|correct|lower|raise|move|reduce|keep|"
-    r"repair|divide|free|write|put|transpose|restore)\b",
-    re.IGNORECASE,
+WORDS = (
+    "expected use save check give drop remove multiply subtract copy choose delete invert add re-save run rename train "
+    "convert compute correct lower raise move reduce keep repair divide free write put transpose restore"
 )
+FIX = re.compile(rf"\b({'|'.join(WORDS.split())})\b", re.IGNORECASE)
 
 
 def message_problem(text: str) -> str | None:

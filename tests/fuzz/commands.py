@@ -41,29 +41,36 @@ SCENE = ["--weights", "w.safetensors", "--target", "cloud.npy", "--demonstration
 # Commands that take seconds, with every file in the case's folder.
 COMMANDS = {
     "imitate": ["imitate", *SCENE, "--num-starts", "4", "--no-plots", "--goal-offset", "0", "0", "0.1", "--out", "out"],
-    "adam": ["imitate", *SCENE, "--method", "adam", "--num-starts", "2", "--iterations", "2", "--k", "0.02", "--out", "out"],
+    "adam": ["imitate", *SCENE, "--method", "adam", "--num-starts", "2", "--iterations", "2", "--k", "0.02", "--out",
+    "out"],
     "demonstrate": [
-        "demonstrate", "--points", "cloud.npy", "--trajectory", "t.tum", "--query-box", "0.06", "--queries", "8", "--grasp", "1",
+        "demonstrate", "--points", "cloud.npy", "--trajectory", "t.tum", "--query-box", "0.06", "--queries", "8",
+        "--grasp", "1",
         "--release", "2", "--seed", "3", "--out", "out.npz",
     ],
     "landscape": [
-        "landscape", *SCENE, "--grid", "xy", "--half", "0.05", "--pitch", "0.05", "--query", "given", "--no-plots", "--out", "out",
+        "landscape", *SCENE, "--grid", "xy", "--half", "0.05", "--pitch", "0.05", "--query", "given", "--no-plots",
+        "--out", "out",
     ],
     "convert": ["convert", "c.pth", "out.safetensors"],
     "dataset": [
-        "dataset", "--out", "out", "--objects", "2", "--validation", "2", "--points", "100", "--queries", "100", "--cameras", "4",
+        "dataset", "--out", "out", "--objects", "2", "--validation", "2", "--points", "100", "--queries", "100",
+        "--cameras", "4",
         "--workers", "1", "--seed", "5",
     ],
     "train": [
-        "train", "--out", "out", "--data", "data", "--steps", "2", "--warmup", "0", "--batch", "2", "--points", "40", "--queries", "8",
+        "train", "--out", "out", "--data", "data", "--steps", "2", "--warmup", "0", "--batch", "2", "--points", "40",
+        "--queries", "8",
         "--box", "4", "--num-poses", "2", *SIZES,
     ],
     "shapes": ["shapes", "--category", "bowl", "--count", "1", "--seed", "2", "--meshes", "meshes", "--out", "out.png"],
     "evaluate": [
-        "evaluate", "--weights", "w.safetensors", "--category", "bottle", "--pairs", "0", "--meshes", "meshes", "--num-poses", "1",
+        "evaluate", "--weights", "w.safetensors", "--category", "bottle", "--pairs", "0", "--meshes", "meshes",
+        "--num-poses", "1",
         "--num-starts", "1", "--iterations", "1", "--json", "out.json",
     ],
-    "benchmark": ["benchmark", "--weights", "w.safetensors", "--pairs", "1", "--seed", "1", "--num-starts", "1", "--out", "out"],
+    "benchmark": ["benchmark", "--weights", "w.safetensors", "--pairs", "1", "--seed", "1", "--num-starts", "1",
+    "--out", "out"],
     "reproduce": ["reproduce", "fig1", "--weights", "w.safetensors", "--fast", "--out", "out"],
 }  # fmt: skip
 # Those whose undamaged form is quick; of the others only what is refused is tried.
@@ -194,10 +201,19 @@ def run(words, folder: Path, seconds: float, around: Callable[[], None] = lambda
         os.unlink(name)
 
 
+def _import_all() -> None:
+    """Import what commands import, so that children need not."""
+    import importlib
+
+    from tdf_jax.cli.main import COMMANDS as names
+
+    for name in (*(f"tdf_jax.cli.{name}" for name in names), "trimesh", "scipy.spatial", "matplotlib.pyplot"):
+        importlib.import_module(name)
+
+
 def judge_command(case: CommandCase, folder: Path) -> tuple[str, str]:
     """Run a case, and judge its exit code, its output and what it wrote."""
-    import tdf_jax.cli.main  # noqa: F401  # so that children need not import it
-
+    _import_all()
     before = snapshot(folder)
     code, output = run(case.words, folder, patience(), case.around)
     after = snapshot(folder)
@@ -273,7 +289,31 @@ def _result_problem(case: CommandCase, folder: Path) -> str | None:
 # What is hostile
 
 
-NUMBERS = ("nan", "inf", "-inf", "-1", "0", "1e999", "-0.0", "abc", "", " ", "1,5", "0x10", "1_000", "²", "1e-30", "1e30", "2.5", str(2**70), "None", "1 2", "--", "@", "\0")  # fmt: skip
+NUMBERS = (
+    "nan",
+    "inf",
+    "-inf",
+    "-1",
+    "0",
+    "1e999",
+    "-0.0",
+    "abc",
+    "",
+    " ",
+    "1,5",
+    "0x10",
+    "1_000",
+    "²",
+    "1e-30",
+    "1e30",
+    "2.5",
+    str(2**70),
+    "None",
+    "1 2",
+    "--",
+    "@",
+    "\0",
+)
 # What cannot be meant by any number.
 NO_NUMBERS = ("nan", "abc", "", " ", "1,5", "²", "None", "1 2", "@")
 SMALL_ONLY = {"--num-poses", "--queries", "--points", "--num-starts", "--iterations", "--objects", "--count", "--pairs"}
@@ -287,7 +327,8 @@ def _hostile_file(rng, world, folder, words):
     """One of the files of a command replaced."""
     kinds = {
         "cloud.npy": (files.cloud_content, files.mesh_content), "demo.npz": (files.demonstration_content,),
-        "t.tum": (files.trajectory_content,), "w.safetensors": (files.weights_content,), "c.pth": (files.checkpoint_content,),
+        "t.tum": (files.trajectory_content,), "w.safetensors": (files.weights_content,),
+        "c.pth": (files.checkpoint_content,),
     }  # fmt: skip
     name = one_of(rng, [word for word in words if word in kinds])
     index = words.index(name)
@@ -443,11 +484,13 @@ def _hostile_surroundings(rng, folder, command):
 
     size = int(rng.choice([0, 10, 100, 1000]))
     options = {
-        f"room for {size} bytes": (full, ANY, False), "the output on /dev/full": (lost, ANY, False), "no output": (closed, ANY, False),
+        f"room for {size} bytes": (full, ANY, False), "the output on /dev/full": (lost, ANY, False),
+        "no output": (closed, ANY, False),
         "nobody reads the output": (broken, ANY, False), "the current folder is gone": (gone, ANY, False),
         "MPLBACKEND of a notebook": (variable("MPLBACKEND", "module://none.backend_inline"), ONLY_RIGHT, True),
         "JAX_PLATFORMS of another machine": (variable("JAX_PLATFORMS", "cuda"), ANY, False),
-        "COLUMNS of 1": (variable("COLUMNS", "1"), ONLY_RIGHT, True), "LANG of C": (variable("LC_ALL", "C"), ONLY_RIGHT, True),
+        "COLUMNS of 1": (variable("COLUMNS", "1"), ONLY_RIGHT, True),
+        "LANG of C": (variable("LC_ALL", "C"), ONLY_RIGHT, True),
         "no HOME": (lambda: os.environ.pop("HOME", None), ONLY_RIGHT, True),
     }  # fmt: skip
     text = one_of(rng, list(options))

@@ -33,13 +33,18 @@ def hostile_cloud(rng, points):
     options = {
         "permuted": (points[rng.permutation(count)], "same"),
         "not finite": (spoilt, "refused"), "a sentinel": (sentinel, "refused"), "transposed": (points.T, "refused"),
-        "20 points": (points[:20], "refused"), "no points": (points[:0], "refused"), "all equal": (points * 0 + 1, "refused"),
-        "all zero": (points * 0, "refused"), "millimetres": (points * 1000, "size"), "centimetres": (points * 100, "size"),
-        "micrometres": (points * 1e6, "size"), "kilometres": (points / 1000, "size"), "huge": (points * np.float32(1e30), "size"),
+        "20 points": (points[:20], "refused"), "no points": (points[:0], "refused"),
+        "all equal": (points * 0 + 1, "refused"),
+        "all zero": (points * 0, "refused"), "millimetres": (points * 1000, "size"),
+        "centimetres": (points * 100, "size"),
+        "micrometres": (points * 1e6, "size"), "kilometres": (points / 1000, "size"),
+        "huge": (points * np.float32(1e30), "size"),
         "tiny": (points.astype(float) * 1e-30, "size"), "squares that overflow": (points * np.float32(1e25), "size"),
-        "map coordinates": (points + np.array([412345, 5412345, 120.0]), "refused"), "300 m away": (points + 300.0, "refused"),
+        "map coordinates": (points + np.array([412345, 5412345, 120.0]), "refused"),
+        "300 m away": (points + 300.0, "refused"),
         "map coordinates, float32": ((points + np.array([412345, 5412345, 120])).astype(np.float32), "refused"),
-        "whole numbers": (np.round(points * 1000).astype(int), "size"), "half precision": (points.astype(np.float16), None),
+        "whole numbers": (np.round(points * 1000).astype(int), "size"),
+        "half precision": (points.astype(np.float16), None),
         "in a plane": (points * [1, 1, 0], None), "on a line": (points * [1, 0, 0], None),
         "one point far away": (np.concatenate([points[:-1], [[90, 0, 0]]]), "size"),
         "quantised": (np.round(points / 0.01) * 0.01, None), "doubled": (np.repeat(points, 2, axis=0), None),
@@ -105,7 +110,8 @@ def describe_case(rng, world: World, folder) -> Case:
 
 def _config(world: World):
     return world.tdf.CarryConfig(
-        num_starts=8, num_coarse_queries=3, coarse_steps=2, prune_steps=2, refine_steps=3, polish_steps=6, num_candidates=3
+        num_starts=8, num_coarse_queries=3, coarse_steps=2, prune_steps=2, refine_steps=3, polish_steps=6,
+        num_candidates=3
     )  # fmt: skip
 
 
@@ -137,11 +143,15 @@ def imitate_case(rng, world: World, folder) -> Case:
     elif draw < 0.7:
         ros, first = goal[[4, 5, 6, 1, 2, 3, 0]], goal[[4, 5, 6, 0, 1, 2, 3]]
         options = {
-            "ROS order": (ros, True), "positions first": (first, True), "norm 2": (goal * 2, True), "zeros": (goal * 0, True),
-            "not finite": (goal * np.r_[1, 1, 1, 1, np.nan, 1, 1], True), "a matrix": (np.eye(4), True), "six numbers": (goal[:6], True),
-            "far away": (goal + np.r_[0, 0, 0, 0, 1e5, 0, 0], True), "words": ("goal", True), "strings": (goal.astype(str), False),
+            "ROS order": (ros, True), "positions first": (first, True), "norm 2": (goal * 2, True),
+            "zeros": (goal * 0, True),
+            "not finite": (goal * np.r_[1, 1, 1, 1, np.nan, 1, 1], True), "a matrix": (np.eye(4), True),
+            "six numbers": (goal[:6], True),
+            "far away": (goal + np.r_[0, 0, 0, 0, 1e5, 0, 0], True), "words": ("goal", True),
+            "strings": (goal.astype(str), False),
             "millimetres": (goal * np.r_[1, 1, 1, 1, 2000, 2000, 2000], True), "a list": (goal.tolist(), False),
-            "float64": (goal.astype(float), False), "a trajectory": (tdf.Trajectory(good.poses()), True), "objects": ([None] * 7, True),
+            "float64": (goal.astype(float), False), "a trajectory": (tdf.Trajectory(good.poses()), True),
+            "objects": ([None] * 7, True),
             "negated": (goal * np.r_[-1, -1, -1, -1, 1, 1, 1], False), "two poses": (good.poses()[:2], True),
         }  # fmt: skip
         text, expected = "goal", ANY

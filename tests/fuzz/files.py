@@ -170,7 +170,8 @@ def mesh_content(rng, world: World, folder):
         "negative index.ply": good.ply_bytes("binary_little_endian", VERTICES, [[-1, 1, 2], *TRIANGLES]),
         "index zero.obj": good.obj_text().replace("f 1 ", "f 0 ", 1) + "f 0 1 2\n",
         "no such vertex.glb": good.glb_bytes(*good.gltf_parts(VERTICES, faces)),
-        "NaN or infinite.glb": good.glb_bytes(scene, np.asarray(spoilt, "<f4").tobytes() + buffer[len(VERTICES) * 12 :]),
+        "NaN or infinite.glb": good.glb_bytes(scene, np.asarray(spoilt,
+        "<f4").tobytes() + buffer[len(VERTICES) * 12 :]),
         "compressed.glb": good.glb_bytes(needed, buffer), "short view.glb": good.glb_bytes(cut, buffer),
         "long accessor.glb": good.glb_bytes(beyond, buffer), "nodes in a circle.glb": good.glb_bytes(circle, buffer),
         "no faces.obj": good.obj_text(VERTICES, []), "no area.obj": good.obj_text(VERTICES * [1, 0, 0], TRIANGLES),
@@ -185,6 +186,8 @@ def mesh_content(rng, world: World, folder):
     path = folder / name
     path.write_bytes(data.encode() if isinstance(data, str) else data)
     read = world.tdf.load_points if name in {"no area.obj", "no faces.obj"} else world.tdf.load_mesh
+    if name == "decimal commas.obj":  # may be read, if it is read right
+        return Case("mesh content", name, lambda: read(path), mesh_problem)
     # 23 vertices without faces are a cloud, and a right one.
     expected = ANY if name == "no faces.obj" else ONLY_REFUSED
     return Case("mesh content", name, lambda: read(path), lambda r: None, expected)
@@ -208,21 +211,29 @@ def cloud_variant(rng):
         f"rows permuted{kind}": text, f"colours behind{kind}": good.text_cloud(points, columns=colours),
         f"tabs{kind}": good.text_cloud(points, "\t"), f"commas{kind}": good.text_cloud(points, ","),
         f"semicolons{kind}": good.text_cloud(points, "; "), f"comments{kind}": "# x y z\n// made by hand\n" + text,
-        f"decimal commas{kind}": good.text_cloud(points, "; ", decimal=","), f"carriage returns{kind}": text.replace("\n", "\r\n"),
-        f"count line{kind}": f"{len(points)}\n" + text, f"names{kind}": "x y z\n" + text, f"names permuted{kind}": mixed,
+        f"decimal commas{kind}": good.text_cloud(points, "; ", decimal=","),
+        f"carriage returns{kind}": text.replace("\n", "\r\n"),
+        f"count line{kind}": f"{len(points)}\n" + text, f"names{kind}": "x y z\n" + text,
+        f"names permuted{kind}": mixed,
         f"byte order mark{kind}": b"\xef\xbb\xbf" + text.encode(), f"UTF-16{kind}": text.encode("utf-16"),
-        f"counting column{kind}": counting, f"no last newline{kind}": text.rstrip("\n"), f"blanks{kind}": text.replace(" ", "   "),
+        f"counting column{kind}": counting, f"no last newline{kind}": text.rstrip("\n"),
+        f"blanks{kind}": text.replace(" ", "   "),
         "names.csv": csv, "quoted names.csv": csv.replace("x,y,z", '"X","Y","Z"'),
         "other columns.csv": good.text_cloud(points[:, [0, 0, 1, 2]], ",", "id,x,y,z\n"),
         "ascii.pcd": good.pcd_bytes("ascii", points), "binary.pcd": good.pcd_bytes("binary", points),
-        "compressed.pcd": good.pcd_bytes("binary_compressed", points), "no POINTS.pcd": good.pcd_bytes("binary", points, with_points=False),
-        "fields permuted.pcd": good.pcd_bytes("binary", points, "yzx"), "fields permuted, ascii.pcd": good.pcd_bytes("ascii", points, "zxy"),
-        "ascii.ply": good.ply_bytes("ascii", points, None), "binary.ply": good.ply_bytes("binary_little_endian", points, None),
-        "big.ply": good.ply_bytes("binary_big_endian", points, None), "doubles.ply": good.ply_bytes("binary_big_endian", points, None, "double"),
+        "compressed.pcd": good.pcd_bytes("binary_compressed", points),
+        "no POINTS.pcd": good.pcd_bytes("binary", points, with_points=False),
+        "fields permuted.pcd": good.pcd_bytes("binary", points, "yzx"),
+        "fields permuted, ascii.pcd": good.pcd_bytes("ascii", points, "zxy"),
+        "ascii.ply": good.ply_bytes("ascii", points, None),
+        "binary.ply": good.ply_bytes("binary_little_endian", points, None),
+        "big.ply": good.ply_bytes("binary_big_endian", points, None),
+        "doubles.ply": good.ply_bytes("binary_big_endian", points, None, "double"),
         "columns permuted.ply": good.ply_bytes("binary_little_endian", points, None, axes="yzx", extra=3),
         "no faces.ply": good.ply_bytes("ascii", points, []),
         "float32.npy": good.npy_bytes(points), "float64.npy": good.npy_bytes(points.astype(float)),
-        "big endian.npy": good.npy_bytes(points.astype(">f4")), "Fortran order.npy": good.npy_bytes(np.asfortranarray(points)),
+        "big endian.npy": good.npy_bytes(points.astype(">f4")),
+        "Fortran order.npy": good.npy_bytes(np.asfortranarray(points)),
         "transposed.npy": good.npy_bytes(points.T), "one more axis.npy": good.npy_bytes(points[None]),
         "colours.npy": good.npy_bytes(np.column_stack([points, points[:, ::-1]])), "named.npy": good.npy_bytes(named),
         "points.npz": good.npz_bytes(points=points), "single.npz": good.npz_bytes(anything=points),
@@ -307,11 +318,11 @@ def cloud_numbers(rng, world: World, folder):
              "xyz": "".join("{:.17g} {:.17g} {:.17g}\n".format(*row) for row in far).encode()}[name[4:]]
         )  # fmt: skip
         tolerance = 1e-9 if np.abs(far).max() > 100 else 1e-6
-        check = lambda found: differs(
-            np.asarray(found, float) - offset,
-            CLOUD.astype(float) * power,
-            max(tolerance, 1e-5 / power if power > 1 else 1e-5),
-        )  # noqa: E731
+        tolerance = max(tolerance, 1e-5 / max(power, 1.0))
+
+        def check(found):
+            return differs(np.asarray(found, float) - offset, CLOUD.astype(float) * power, tolerance)
+
         return Case("cloud numbers", f"{power:g} at {offset[0]:g} in {name}", lambda: read(path), check, ANY)
     options = [{"scale": value} for value in (0, -1, np.nan, np.inf, "1", None, [1.0], 1j, True, np.zeros(3), {})]
     options += [{"count": value} for value in (0, -3, 2.5, "30", True, np.nan, [30], 10.0)]
@@ -374,10 +385,12 @@ def demonstration_content(rng, world: World, folder):
         "points in mm or cm": {"points": points * unit}, "poses in mm or cm": {"wxyz_xyz": poses * position},
         "all in mm or cm": {"points": points * unit, "wxyz_xyz": poses * position, "query": query * unit},
         "positions first, w last": {"wxyz_xyz": ros}, "positions first": {"wxyz_xyz": shuffled},
-        "a quaternion of norm 2": {"wxyz_xyz": poses * [[2.0] * 4 + [1.0] * 3]}, "a quaternion of zeros": {"wxyz_xyz": poses * [0, 0, 0, 0, 1, 1, 1]},
+        "a quaternion of norm 2": {"wxyz_xyz": poses * [[2.0] * 4 + [1.0] * 3]},
+        "a quaternion of zeros": {"wxyz_xyz": poses * [0, 0, 0, 0, 1, 1, 1]},
         "no poses": {"wxyz_xyz": poses[:0]}, "poses far away": {"wxyz_xyz": poses + np.r_[0, 0, 0, 0, 3, 0, 0]},
         "matrices": {"wxyz_xyz": np.tile(np.eye(4), (4, 1, 1))},
-        "grasp beyond": {"grasp": np.int64(one_of(rng, [4, 99, -5, 2**40]))}, "release beyond": {"release": np.int64(one_of(rng, [4, 99, -5]))},
+        "grasp beyond": {"grasp": np.int64(one_of(rng, [4, 99, -5, 2**40]))},
+        "release beyond": {"release": np.int64(one_of(rng, [4, 99, -5]))},
         "release first": {"grasp": np.int64(3), "release": np.int64(0)}, "grasp of 0.5": {"grasp": np.float64(0.5)},
         "two grasps": {"grasp": np.array([0, 1])}, "a newer schema": {"schema": np.int64(one_of(rng, [0, -1, 99]))},
         "schema in words": {"schema": np.array("two")}, "everything NaN": {"points": points * np.nan},
@@ -399,13 +412,18 @@ def trajectory_reader(rng, world: World) -> Reader:
     names = [list(good.COLUMNS)[i] for i in rng.permutation(7)]
     more = [*names[:3], "time", *names[3:], "speed"]
     options = {
-        "t.npz": good.npz_bytes(wxyz_xyz=poses), "double.npz": good.npz_bytes(wxyz_xyz=poses.astype(">f8"), other=np.zeros(2)),
+        "t.npz": good.npz_bytes(wxyz_xyz=poses),
+        "double.npz": good.npz_bytes(wxyz_xyz=poses.astype(">f8"), other=np.zeros(2)),
         "t.tum": good.tum_text(poses), "comments.tum": good.tum_text(poses, head="# t x y z qx qy qz qw\n"),
-        "tabs.tum": good.tum_text(poses, separator="\t"), "carriage returns.tum": good.tum_text(poses).replace("\n", "\r\n"),
-        "mark.tum": "\ufeff" + good.tum_text(poses), "t.csv": good.csv_text(poses), "permuted.csv": good.csv_text(poses, names),
+        "tabs.tum": good.tum_text(poses, separator="\t"),
+        "carriage returns.tum": good.tum_text(poses).replace("\n", "\r\n"),
+        "mark.tum": "\ufeff" + good.tum_text(poses), "t.csv": good.csv_text(poses),
+        "permuted.csv": good.csv_text(poses, names),
         "semicolons.csv": good.csv_text(poses, names, ";"), "tabs.csv": good.csv_text(poses, names, "\t"),
-        "other columns.csv": good.csv_text(poses, more), "upper case.csv": good.csv_text(poses).replace("qw,qx,qy,qz,x,y,z", "QW,QX,QY,QZ,X,Y,Z"),
-        "quoted.csv": good.csv_text(poses).replace("qw,qx", '"qw","qx"'), "blanks.csv": good.csv_text(poses, names, " "),
+        "other columns.csv": good.csv_text(poses, more),
+        "upper case.csv": good.csv_text(poses).replace("qw,qx,qy,qz,x,y,z", "QW,QX,QY,QZ,X,Y,Z"),
+        "quoted.csv": good.csv_text(poses).replace("qw,qx", '"qw","qx"'),
+        "blanks.csv": good.csv_text(poses, names, " "),
     }  # fmt: skip
     name = one_of(rng, list(options))
     data = options[name]
@@ -429,17 +447,23 @@ def trajectory_content(rng, world: World, folder):
     options = {
         f"{odd[0]}.npz": good.npz_bytes(wxyz_xyz=odd[1]), "another name.npz": good.npz_bytes(poses=poses),
         "objects.npz": good.npz_bytes(wxyz_xyz=np.full(3, None, object)),
-        "transposed.npz": good.npz_bytes(wxyz_xyz=poses[:3].T), "ROS order.npz": good.npz_bytes(wxyz_xyz=poses[:, [4, 5, 6, 1, 2, 3, 0]]),
-        "not finite.npz": good.npz_bytes(wxyz_xyz=spoilt), "not finite.tum": good.tum_text(spoilt), "not finite.csv": good.csv_text(spoilt),
+        "transposed.npz": good.npz_bytes(wxyz_xyz=poses[:3].T),
+        "ROS order.npz": good.npz_bytes(wxyz_xyz=poses[:, [4, 5, 6, 1, 2, 3, 0]]),
+        "not finite.npz": good.npz_bytes(wxyz_xyz=spoilt), "not finite.tum": good.tum_text(spoilt),
+        "not finite.csv": good.csv_text(spoilt),
         "another order, named.tum": good.tum_text(poses, (4, 5, 6, 0, 1, 2, 3), head="# t x y z qw qx qy qz\n"),
         "quaternion first.tum": good.tum_text(poses, (0, 1, 2, 3, 4, 5, 6)),
         "seven columns.tum": good.tum_text(poses, order[:6]), "nine columns.tum": good.tum_text(poses, (*range(7), 0)),
         "words.tum": good.tum_text(poses).replace("0 ", "zero ", 1), "commas.tum": good.tum_text(poses, separator=","),
-        "no rows.tum": "# nothing\n", "no rows.csv": ",".join(good.COLUMNS) + "\n", "no names.csv": good.csv_text(poses).partition("\n")[2],
-        "a column missing.csv": good.csv_text(poses, [n for n in good.COLUMNS if n != one_of(rng, list(good.COLUMNS))][:6]),
-        "a column twice.csv": good.csv_text(poses, [*good.COLUMNS, "qw"]), "norm of 3.csv": good.csv_text(poses * [3, 3, 3, 3, 1, 1, 1]),
+        "no rows.tum": "# nothing\n", "no rows.csv": ",".join(good.COLUMNS) + "\n",
+        "no names.csv": good.csv_text(poses).partition("\n")[2],
+        "a column missing.csv": good.csv_text(poses, [n for n in good.COLUMNS if n != one_of(rng,
+        list(good.COLUMNS))][:6]),
+        "a column twice.csv": good.csv_text(poses, [*good.COLUMNS, "qw"]),
+        "norm of 3.csv": good.csv_text(poses * [3, 3, 3, 3, 1, 1, 1]),
         "decimal commas.csv": good.csv_text(poses, separator=";").replace(".", ","),
-        "a short row.csv": good.csv_text(poses) + "1,2\n", "metres times 1e6.csv": good.csv_text(poses * [1, 1, 1, 1, 1e6, 1e6, 1e6]),
+        "a short row.csv": good.csv_text(poses) + "1,2\n",
+        "metres times 1e6.csv": good.csv_text(poses * [1, 1, 1, 1, 1e6, 1e6, 1e6]),
         "zeros.csv": good.csv_text(poses * 0), "no numbers.csv": good.csv_text(poses).replace("0.", "a.", 1),
     }  # fmt: skip
     name = one_of(rng, list(options))
@@ -486,7 +510,8 @@ def weights_content(rng, world: World, folder):
     field = one_of(rng, sorted(config))
     wrong = one_of(rng, [-1, 0, 10**12, "6", None, [1], 1e400, True, {}])
     what = one_of(
-        rng, ["not finite", "half", "double", "one missing", "one more", "another shape", "config", "info", "schema", "bare", "not JSON"]
+        rng, ["not finite", "half", "double", "one missing", "one more", "another shape", "config", "info", "schema",
+        "bare", "not JSON"]
     )  # fmt: skip
     match what:
         case "not finite":
@@ -517,7 +542,13 @@ def weights_content(rng, world: World, folder):
     path.write_bytes(safetensors.numpy.save(tensors, text))
     # An offset is a number with a right value, and so is a slope; other values of theirs are another network.
     told = f"{what} {name if 'onfig' not in what else field} {wrong if what in ('config', 'info') else ''}"
-    return Case("weights content", told, lambda: world.tdf.load_model(path), not_finite, ANY if what in ("config", "info") else ONLY_REFUSED)  # fmt: skip
+    return Case(
+        "weights content",
+        told,
+        lambda: world.tdf.load_model(path),
+        not_finite,
+        ANY if what in ("config", "info") else ONLY_REFUSED,
+    )
 
 
 def checkpoint_reader(rng, world: World) -> Reader:
@@ -551,7 +582,8 @@ def checkpoint_content(rng, world: World, folder):
             return (open, (str(folder / "pwned"), "w"))
 
     what = one_of(
-        rng, ["a program", "a dictionary", "a list", "no storage", "short storage", "long storage", "byte order", "unknown byte order",
+        rng, ["a program", "a dictionary", "a list", "no storage", "short storage", "long storage", "byte order",
+        "unknown byte order",
               "two pickles", "no pickle", "legacy", "deep pickle", "not finite", "empty archive", "another archive"]
     )  # fmt: skip
     expected = ONLY_REFUSED
@@ -627,7 +659,8 @@ def landscape_content(rng, world: World, folder):
     field = one_of(rng, sorted(header))
     options = {
         f"{name}: {odd[0]}": {name: odd[1]}, f"no {name}": {name: None},
-        "values transposed": {"values": np.moveaxis(arrays["values"], 0, -1)}, "waypoints missing": {"waypoints": arrays["waypoints"][:2]},
+        "values transposed": {"values": np.moveaxis(arrays["values"], 0, -1)},
+        "waypoints missing": {"waypoints": arrays["waypoints"][:2]},
         "turned beyond": {"turned": arrays["turned"] + 7}, "turned negative": {"turned": arrays["turned"] - 9},
         "turned in floats": {"turned": arrays["turned"] + 0.5},
         "header in words": {"header": np.array("hello")}, "header of a list": {"header": np.array("[]")},
@@ -650,7 +683,9 @@ def landscape_content(rng, world: World, folder):
         "header without unit",
         "header without about",
     }
-    return Case("landscape content", what, lambda: world.tdf.load_landscape(path), expected=ANY if harmless else ONLY_REFUSED)  # fmt: skip
+    return Case(
+        "landscape content", what, lambda: world.tdf.load_landscape(path), expected=ANY if harmless else ONLY_REFUSED
+    )
 
 
 def folder_case(rng, world: World, folder):
@@ -729,9 +764,12 @@ def _wrong_settings(rng, files, is_data):
         return f"{field} is {value!r}", "dataset.json"
     entry = good.SIDECAR_ENTRY
     wrong = one_of(
-        rng, [{"unit": 0}, {"unit": -1}, {"unit": "m"}, {"unit": None}, {"unit": 1000}, {"up": "z"}, {"up": 3}, {"symmetry": "square"},
-              {"symmetry": 2}, {"category": "vase"}, {"category": None}, {"places": 3}, {"places": {"rim": [[1]]}}, {"unit": float("nan")},
-              {"places": {"top": np.eye(4).tolist()}}, {"stranger": 1}, {"unit": True}, {"up": ["+z"]}, {"category": []}]
+        rng, [{"unit": 0}, {"unit": -1}, {"unit": "m"}, {"unit": None}, {"unit": 1000}, {"up": "z"}, {"up": 3},
+        {"symmetry": "square"},
+              {"symmetry": 2}, {"category": "vase"}, {"category": None}, {"places": 3}, {"places": {"rim": [[1]]}},
+              {"unit": float("nan")},
+              {"places": {"top": np.eye(4).tolist()}}, {"stranger": 1}, {"unit": True}, {"up": ["+z"]},
+              {"category": []}]
     )  # fmt: skip
     entries: Any = {"bottle.obj": entry | wrong}
     if rng.random() < 0.3:
@@ -755,7 +793,7 @@ def _wrong_settings(rng, files, is_data):
 
 
 def run_folder_case(rng, world: World, folder):
-    """Settings, metrics and checkpoint of a training run; a checkpoint has no checksum, so its numbers are not judged."""
+    """Settings, metrics and checkpoint of a training run; a checkpoint has no checksum: its numbers are not judged."""
     from tdf_jax.training import run_folder
 
     params = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.ones(4, np.float32)}
@@ -784,7 +822,8 @@ def run_folder_case(rng, world: World, folder):
 
 
 READERS = (
-    mesh_reader, cloud_reader, demonstration_reader, trajectory_reader, weights_reader, checkpoint_reader, landscape_reader
+    mesh_reader, cloud_reader, demonstration_reader, trajectory_reader, weights_reader, checkpoint_reader,
+    landscape_reader
 )  # fmt: skip
 TEXTS = (".obj", ".off", ".xyz", ".txt", ".asc", ".pts", ".csv", ".tum", ".gltf")
 
@@ -871,7 +910,12 @@ def saved_case(rng, world: World, folder):
     text, path, readable = one_of(rng, damage.PATHS)(rng, folder, name, b"before")
     places = {str(path), str(folder / "real")} if not isinstance(path, type(None)) else set()
     del places
-    fine = text not in {"a folder", "a path through a file", "a name of 400 characters", "a name with a zero byte"} and not text.startswith("the path")  # fmt: skip
+    fine = text not in {
+        "a folder",
+        "a path through a file",
+        "a name of 400 characters",
+        "a name with a zero byte",
+    } and not text.startswith("the path")
     names = tuple(
         str(p.relative_to(folder)) for p in [folder / "real", folder / "middle", folder / "other", folder / "nothing"]
     )
@@ -901,7 +945,8 @@ def file_case(rng, world: World, folder) -> Case:
     if draw < 0.56:
         return renamed_case(rng, world, folder, make)
     content = (
-        mesh_content, cloud_content, cloud_content, cloud_numbers, demonstration_content, trajectory_content, weights_content,
+        mesh_content, cloud_content, cloud_content, cloud_numbers, demonstration_content, trajectory_content,
+        weights_content,
         checkpoint_content, landscape_content, folder_case, folder_case, run_folder_case, saved_case, saved_case,
     )  # fmt: skip
     return one_of(rng, content)(rng, world, folder)
