@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax.traverse_util import unflatten_dict
+from jax._src import compiler
 from scipy.spatial.transform import Rotation
 
 if "TDF_CHECK_TYPES" in os.environ:  # as `make test-types` does: every annotation is checked, shapes included
@@ -34,10 +35,23 @@ from tdf_jax.networks.field import DescriptorField
 from tdf_jax.networks.occupancy import OccupancyNetwork, condition, parameter_shapes
 
 jax.config.update("jax_debug_nans", True)
+jax.config.update("jax_traceback_in_locations_limit", 0)  # a tenth of the compilation of a small program
+
+# Most of the time of a test is compilation, and half of that are optimisations that change rounding only.
+QUICK = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
+_compile_options = compiler.get_compile_options
+
+
+def _quick_compile_options(*sizes, env_options_overrides=None, **about):
+    quick = QUICK if jax.config.read("jax_disable_most_optimizations") else {}
+    return _compile_options(*sizes, env_options_overrides=quick | (env_options_overrides or {}), **about)
+
+
+compiler.get_compile_options = _quick_compile_options
 
 
 def pytest_runtest_setup(item):
-    """LLVM's optimisation is half of a compilation and changes rounding only; parity, and what runs long, keep it."""
+    """Programs are compiled with few optimisations, but for parity and for what runs long."""
     long = item.get_closest_marker("slow") and "small_model" not in item.fixturenames
     parity = "golden" in item.fixturenames
     quick = "quick_compilation" in item.fixturenames or not (long or parity)
