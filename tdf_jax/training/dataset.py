@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import json
 import multiprocessing
+import warnings
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +19,7 @@ from tqdm import tqdm
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.cache import digest
-from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.errors import InputError, SizeWarning
 from tdf_jax._internal.files import replace_file
 from tdf_jax.evaluation.mesh_folder import deeper, file_names, is_mesh, warn_of_deeper
 from tdf_jax.geometry.symmetry import FOLDS
@@ -34,6 +35,7 @@ SPLITS = ("training", "validation")
 VALIDATION_SEED = 1_000_003  # added to the recipe's seed; objects are a function of (seed, index)
 BITS = "inside", "visible"  # fields stored as single bits
 HELD_OUT = 10  # one mesh file in so many is held out for validation, at least one
+PLAUSIBLE = (0.01, 3.0)  # metres, between which the median of the objects' diagonals raises no doubt of the unit
 UNIT_SPREAD = 20.0  # largest diagonal over the smallest in a folder; a larger ratio means that units are mixed
 
 
@@ -334,6 +336,14 @@ def _check_meshes(recipe, files, progress):
         raise InputError(
             f"tdf dataset: {small} measures {diagonals[small]:.3g} m across and {large} {diagonals[large]:.3g} m; "
             "expected one unit in all files. Rescale some"
+        )
+    median = float(np.median(list(diagonals.values())))
+    if not PLAUSIBLE[0] <= median <= PLAUSIBLE[1]:
+        warnings.warn(
+            f"tdf dataset: the meshes measure {median:.3g} m across; expected objects in metres. They are learnt in "
+            "any unit, but if they are in millimetres, give --unit 0.001, in centimetres --unit 0.01",
+            SizeWarning,
+            stacklevel=2,
         )
 
 

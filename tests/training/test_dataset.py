@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from tdf_jax._internal.errors import InputError, TdfWarning
+from tdf_jax._internal.errors import InputError, SizeWarning, TdfWarning
 from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.shapes import FAMILIES, build_mug, sample_mug
 from tdf_jax.training import dataset
@@ -487,6 +488,18 @@ def test_a_data_set_of_another_symmetry_is_another_one():
 def test_bad_recipes(changes, message):
     with pytest.raises(InputError, match=message):
         dataclasses.replace(RECIPE, **changes)
+
+
+def test_meshes_that_are_probably_not_in_metres_are_warned_of(tmp_path):
+    pytest.importorskip("igl")
+    for index in range(2):
+        trimesh.creation.icosphere(subdivisions=1, radius=50.0 + index).export(tmp_path / f"ball{index}.obj")
+    recipe, files = scanned_recipe(tmp_path), sorted(tmp_path.glob("*.obj"))
+    with pytest.warns(SizeWarning, match="measure 17. m across; .*in millimetres, give --unit 0.001"):
+        dataset._check_meshes(dataclasses.replace(recipe, unit=1.0), files, False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        dataset._check_meshes(dataclasses.replace(recipe, unit=0.001), files, False)
 
 
 def test_empty_folders_bad_meshes_and_mixed_units_are_refused_before_any_work(meshes, tmp_path):
