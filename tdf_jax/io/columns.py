@@ -21,7 +21,9 @@ _UNITS |= {"metre": 1.0, "metres": 1.0, "meter": 1.0, "meters": 1.0, "inch": 0.0
 _UNITS |= {"millimetres": 1e-3, "millimeters": 1e-3, "centimetres": 1e-2, "centimeters": 1e-2}
 _MISSING = {"", "null", "none", "na", "n/a", "-", "--"}
 _MIXED = "has numbers with commas as well as points; expected decimal points only; remove the commas"
-_HEADER_FIX = "write the names of the columns into the first line, such as x y z"
+# Six fields without a decimal point are enough for three numbers with decimal commas: 0,12,0,34,0,56.
+_WHOLE = r"\s*[+-]?\d+([eE][+-]?\d+)?\s*"
+_WHOLE_FIELDS = re.compile(f"{_WHOLE}(,{_WHOLE}){{5}}(,|$)")
 
 
 def read_columns(data: bytes, scale: float = 1.0) -> Float[np.ndarray, "points 3"]:
@@ -60,17 +62,16 @@ def read_columns(data: bytes, scale: float = 1.0) -> Float[np.ndarray, "points 3
     else:
         table = []
         width, row_names = values.shape[1], _count_rows(values[:, 0])
-    if header is None and delimiter == "," and width >= 6 and width % 2 == 0:
-        if all(re.fullmatch(r"[-+\d,\s]+", row) for _, row in rows):
-            raise UnsupportedError(
-                f"has {width} columns of whole numbers between commas, which may be decimal commas; expected decimal "
-                f"points; if they are whole numbers, {_HEADER_FIX.replace('x y z', 'x,y,z,r,g,b')}"
-            )
-    columns = _named(names, width, row_names, scale, required=header is not None)
+    columns = _named(names, width, row_names and delimiter is None, scale, required=header is not None)
     if columns is not None:
         return _values(table, columns, rows) if values is None else values[:, columns]
     if width < 3:
         raise UnsupportedError(f"has {width} columns; expected x, y and z in each line")
+    if delimiter == "," and width >= 6 and all(_WHOLE_FIELDS.match(row) for _, row in rows):
+        raise UnsupportedError(
+            f"has {width} columns between commas, which may be whole numbers or decimal commas; expected decimal "
+            "points; if they are whole numbers, write the names of all columns into the first line, such as x,y,z,r,g,b"
+        )
     if values is None:
         values = np.full((len(table), width), np.nan)
         for column in range(width if width <= MOST_COLUMNS else 0):
@@ -92,8 +93,8 @@ def coordinate_columns(values: Float[np.ndarray, "rows columns"]) -> Float[np.nd
         The coordinates, (rows, 3).
 
     Raises:
-        UnsupportedError: there are less than three columns or more than 12, the first may be a number of the point or
-            a label, or the rows are poses.
+        UnsupportedError: there are less than three columns or more than 20, the first may be a number of the point, a
+            time or a label, or the rows are poses.
     """
     rows, width = values.shape
     if width < 3:
@@ -102,7 +103,6 @@ def coordinate_columns(values: Float[np.ndarray, "rows columns"]) -> Float[np.nd
         raise UnsupportedError(
             f"has {width} columns; expected at most {MOST_COLUMNS}, x y z first; keep the first three"
         )
-    whole = [np.isfinite(column).all() and (column == np.rint(column)).all() for column in values.T[:4]]
     counts = _count_rows(values[:, 0])
     if width == 3:
         if counts:
@@ -110,13 +110,18 @@ def coordinate_columns(values: Float[np.ndarray, "rows columns"]) -> Float[np.nd
         return values
     if counts:
         return values[:, 1:4]
-    if whole[0] and not any(whole[1:]):
-        raise UnsupportedError(
-            "has a first column of whole numbers, which may be numbers of the points or labels, before columns that "
-            f"are not; expected x y z first; remove that column, or {_HEADER_FIX}"
-        )
     if _are_poses(values):
         raise UnsupportedError("has rows that are poses, or quaternions of norm 1; expected points x y z")
+    whole = [np.isfinite(column).all() and (column == np.rint(column)).all() for column in values.T[:4]]
+    rising = [rows > 1 and bool((np.diff(column) > 0).all()) for column in values.T[:4]]
+    values_of = [len(np.unique(column)) for column in values.T[:4]]
+    few = [(whole[0] or values_of[0] == 1) and 4 * values_of[0] <= min(values_of[1:]), False]
+    for flags, kind in ((whole, "whole numbers"), (rising, "rising numbers"), (few, "few different numbers")):
+        if flags[0] and not any(flags[1:]):
+            raise UnsupportedError(
+                f"has a first column of {kind}, unlike those behind it, which may be numbers of the points, times or "
+                "labels; expected x y z first; remove the first column, or all columns behind x y z"
+            )
     return values[:, :3]
 
 
@@ -189,10 +194,10 @@ def _dialect(rows):
     if "," not in text:
         return None, False
     words = [row.split() for row in rows]
-    decimal = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?,?")
-    inner = any("," in word[:-1] for row in words for word in row)
+    decimal = re.compile(r",?[+-]?\d+(,\d+)?([eE][+-]?\d+)?,?")
+    inner = any(re.search(r"\d,\d", word) for row in words for word in row)
     if inner and all(len(row) >= 3 for row in words):
-        if all(decimal.fullmatch(word) for row in words for word in row):
+        if all(decimal.fullmatch(word) for row in words for word in row if "," in word or "." in word):
             return None, True
         if all(re.fullmatch(r"[-+\d.,eE]+", word) for row in words for word in row):
             raise UnsupportedError(_MIXED)
@@ -228,7 +233,7 @@ def _table(rows, delimiter, comma):
 
 def _split(row, delimiter, comma):
     if delimiter is None:
-        cells = [cell.rstrip(",") for cell in row.split()] if comma else row.split()
+        cells = [cell.strip(",") for cell in row.split()] if comma else row.split()
     elif '"' in row:  # where a delimiter is no delimiter
         cells = [cell.strip() for cell in next(csv.reader([row], delimiter=delimiter, skipinitialspace=True))]
     else:

@@ -119,7 +119,7 @@ UNSUPPORTED = {
     "a picture": (np.zeros((40, 40, 3), np.uint8), r"has shape \(40, 40, 3\) and type uint8"),
     "poses": (np.hstack([ONES, 0 * CLOUD, CLOUD]), "rows that are poses"),
     "quaternions": (np.hstack([0 * CLOUD, ONES]), "poses, or quaternions of norm 1"),
-    "labels": (np.hstack([np.arange(40)[:, None] % 3, CLOUD]), "numbers of the points or labels"),
+    "labels": (np.hstack([np.arange(40)[:, None] % 3, CLOUD]), "numbers of the points, times or labels"),
     "complex": (CLOUD.astype(complex), "has numbers of type complex128; expected floats"),
     "logical": (CLOUD > 0, "has numbers of type bool; expected floats"),
     "words": (CLOUD.astype(str), r"has numbers of type <U\d+; expected floats; save points.astype\(np.float64\)"),

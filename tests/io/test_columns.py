@@ -34,6 +34,7 @@ VALID = {
     "tabs": text("\t"),
     "commas": text(","),
     "commas and blanks": text(", "),
+    "blanks and commas": text(" ,", behind=("0.5",)),
     "commas at the end": text(",", end=",\n"),
     "semicolons": text(";"),
     "semicolons and blanks": text(" ; ", end=" ;\n"),
@@ -41,6 +42,8 @@ VALID = {
     "decimal commas and tabs": text("\t", decimal=","),
     "decimal commas and semicolons": text(";", decimal=","),
     "decimal commas, commas and blanks": text(", ", decimal=","),
+    "decimal commas, blanks and commas": text(" ,", decimal=","),
+    "decimal commas and words behind": text(behind=("mug",), decimal=","),
     "decimal commas and some whole numbers": text(behind=("1", "2"), decimal=","),
     "exponents": text(rows=[[f"{x:.12E}" for x in point] for point in CLOUD]),
     "exponents of Fortran": text(rows=[[f"{x:.12E}".replace("E", "D") for x in point] for point in CLOUD]),
@@ -52,6 +55,7 @@ VALID = {
     "intensity": text(behind=("0.5",)),
     "homogeneous": text(behind=("1",)),
     "words behind": text(behind=("mug",)),
+    "sorted": text(rows=sorted(POINTS, key=lambda row: float(row[0]))),
     "comments": text(head="# made by a program\n// a cloud\n% more\n", end=" # point\n"),
     "a comment of names": text(head="# x y z nx ny nz\n", behind=NORMAL),
     "a comment of names of CloudCompare": text(head="//X Y Z R G B\n", behind=COLOUR),
@@ -100,7 +104,8 @@ VALID = {
 def test_a_cloud_is_read_in_every_dialect(tmp_path, name):
     content = VALID[name]
     (tmp_path / "cloud.xyz").write_bytes(content if isinstance(content, bytes) else content.encode())
-    np.testing.assert_allclose(load_points(tmp_path / "cloud.xyz"), CLOUD, atol=1e-8)
+    expected = sorted(CLOUD, key=lambda row: row[0]) if name == "sorted" else CLOUD
+    np.testing.assert_allclose(load_points(tmp_path / "cloud.xyz"), expected, atol=1e-8)
 
 
 @pytest.mark.parametrize("suffix", [".xyz", ".txt", ".csv", ".asc", ".pts", ".XYZ"])
@@ -148,15 +153,15 @@ UNSUPPORTED = {
     ),
     "labels": (
         text(before=(lambda i: str(i % 3),)),
-        "numbers of the points or labels.*; expected x y z first; remove that",
+        "numbers of the points, times or labels; expected x y z first; remove the first",
     ),
     "numbers from seven": (
         text(before=(lambda i: str(i + 7),)),
-        "a first column of whole numbers, which may be numbers",
+        "a first column of whole numbers, unlike those behind it",
     ),
     "numbers with gaps": (
         text(before=(lambda i: str(3 * i + 5),)),
-        "a first column of whole numbers, which may be numbers",
+        "a first column of whole numbers, unlike those behind it",
     ),
     "labels of one value": (text(",", before=("7",)), "a first column of whole numbers"),
     "numbers before two columns": (
@@ -165,8 +170,31 @@ UNSUPPORTED = {
     ),
     "decimal commas between commas": (
         text(",", decimal=","),
-        "6 columns of whole numbers between commas, which may be decimal",
+        "6 columns between commas, which may be whole numbers or decimal",
     ),
+    "decimal commas between commas, and a number": (
+        text(",", before=(index,), decimal=","),
+        "7 columns between commas",
+    ),
+    "decimal commas and exponents between commas": (
+        text(",", rows=[[f"{x:.6e}" for x in point] for point in CLOUD], decimal=","),
+        "6 columns between commas, which may be",
+    ),
+    "decimal commas behind whole numbers": (
+        text(
+            ",",
+            head="id,x,y,z,i\n",
+            before=(index,),
+            behind=("0,5",),
+            rows=[[f"{x * 1000:.0f}" for x in p] for p in CLOUD],
+        ),
+        "names 5 columns in its first line, and has 6",
+    ),
+    "labels before whole millimetres": (
+        text(before=(lambda i: str(i % 4),), rows=[[f"{x * 1000:.0f}" for x in point] for point in CLOUD]),
+        "a first column of few different numbers",
+    ),
+    "times": (text(before=(lambda i: f"{i / 30:.3f}",)), "a first column of rising numbers, unlike those behind it"),
     "commas of thousands": (text(rows=[["1,234.5", *row[1:]] for row in POINTS]), "commas as well as points"),
     "commas and points": (
         text(";", rows=[[row[0].replace(".", ","), *row[1:]] for row in POINTS]),
