@@ -86,25 +86,25 @@ def tiles(folder: Path) -> dict[str, object] | None:
 COMMANDS = {
     "train": Command(
         (
-            "train", "--data", "../data", "--out", "out", "--steps=30", "--batch=2", "--points=32", "--queries=16",
-            "--box=4", "--num-poses=2", "--warmup=2", "--validate-every=15", "--save-seconds=0",
+            "train", "--data", "../data", "--out", "out", "--steps=300", "--batch=2", "--points=32", "--queries=16",
+            "--box=4", "--num-poses=2", "--warmup=2", "--validate-every=150", "--save-seconds=0",
             *(f"--network.{size}" for size in NETWORK),
         ),
         steps,
     ),
     "dataset": Command(
-        ("dataset", "--out", "out", "--objects", "12", *OBJECTS, "--workers", "2"), files("out/*.npz")
+        ("dataset", "--out", "out", "--objects", "40", *OBJECTS, "--workers", "2"), files("out/*.npz")
     ),
     "landscape": Command(
         (
-            "landscape", *SCENE, "--half", "0.1", "--pitch", "0.05", "--rotation", "turns", "--rotations", "8",
+            "landscape", *SCENE, "--half", "0.1", "--pitch", "0.05", "--rotation", "turns", "--rotations", "64",
             "--no-page", "--out", "out",
         ),
         tiles,
     ),
     "benchmark": Command(
         (
-            "benchmark", "--weights", "../small.safetensors", "--pairs", "4", "--methods", "copy", "centroids", "PCA",
+            "benchmark", "--weights", "../small.safetensors", "--pairs", "8", "--methods", "copy", "centroids", "PCA",
             "--out", "out",
         ),
         files("out/runs/*.npz"),
@@ -257,15 +257,20 @@ def run_through(folder: Path, name: str, expected, first: float, last: float, rn
             os.utime(path, (EARLIER, EARLIER))
     kills, problems, parts = [], [], {}
     for _ in range(rng.integers(2, 6)):
-        early = rng.random() < 0.15
-        moment = float(rng.uniform(0, first) if early else rng.uniform(0.9 * first, 1.05 * last))
+        # Most kills come after the first change of a file, however busy the machine is.
+        wait, delay = (0.0, rng.uniform(0, first)) if rng.random() < 0.15 else (HANG, rng.uniform(0, last - first))
+        before = changes(place)
         with started(folder, place, command.words) as run:
+            began = time.monotonic()
+            while time.monotonic() - began < wait and run.poll() is None and changes(place) == before:
+                time.sleep(0.01)
             try:
-                run.wait(moment)
+                run.wait(delay)
                 break  # it ended before
             except subprocess.TimeoutExpired:
                 run.kill()
             run.wait()
+            moment = time.monotonic() - began
             problems += left_processes(run.pid)
         problems += broken(place) + tracebacks(folder)
         if replaces and not (place / "out").is_dir() and not list(place.glob(".out.*.replaced")):
@@ -286,6 +291,15 @@ def run_through(folder: Path, name: str, expected, first: float, last: float, rn
     if not problems:
         shutil.rmtree(place)
     return {"command": name, "number": number, "replaces": replaces, "kills": kills, "problems": problems}
+
+
+def changes(folder: Path) -> dict[str, int]:
+    """Times of the last changes below a folder."""
+    times = {}
+    for path in folder.rglob("*"):
+        with contextlib.suppress(FileNotFoundError):
+            times[str(path)] = path.stat().st_mtime_ns
+    return times
 
 
 def lost(before: dict[str, object], now: dict[str, object] | None) -> list[str]:
