@@ -87,9 +87,10 @@ def load_demonstration(path: str | os.PathLike) -> Demonstration:
             arrays = {name: archive[name] for name in names if name in archive}
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
         raise InputError(f"load_demonstration(): {path} cannot be read as .npz ({error}); save it again") from None
-    absent = ", ".join(name for name in ARRAYS if name not in arrays)
+    expected = (*ARRAYS, *INDICES) if "schema" in arrays else ARRAYS
+    absent = ", ".join(name for name in expected if name not in arrays)
     if absent:
-        raise InputError(f"load_demonstration(): {path} has no array {absent}; expected {', '.join(ARRAYS)}")
+        raise InputError(f"load_demonstration(): {path} has no array {absent}; expected {', '.join(expected)}")
     for name, array in arrays.items():
         if array.dtype.kind not in "fiu":
             raise InputError(f"load_demonstration(): {name} in {path} has dtype {array.dtype}; expected numbers")

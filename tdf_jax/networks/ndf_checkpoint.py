@@ -47,7 +47,7 @@ def convert_checkpoint(path: str | os.PathLike, name: str | None = None, prefix:
         InputError: the file is of another kind or damaged, holds no such network or several, or the network is of
             another architecture.
     """
-    path = checks.path("convert_checkpoint()", path)
+    path = checks.existing_file("convert_checkpoint()", path)
     try:
         with opened(path) as file:
             config, params = _convert(file, prefix)
@@ -88,7 +88,7 @@ def _convert(file: TensorFile, prefix: str | None) -> tuple[NetworkConfig, dict]
             raise Refusal(f"its tensor {prefix}{name} {reason}") from None
     problems = value_problems(tensors)
     if problems:
-        raise Refusal(f"NaN, infinite or too large for float32: {problems}")
+        raise Refusal(f"NaN, infinite or too large for float32: {problems}; train or copy the weights again")
     params = {name.replace(".weight", ".kernel"): jnp.array(tensor.T) for name, tensor in tensors.items()}
     return config, unflatten_dict(params, sep=".")
 

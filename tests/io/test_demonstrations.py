@@ -91,7 +91,8 @@ def test_grasp_and_release_survive_the_file(tmp_path, demonstration, indices):
         ({"release": [1, 2]}, "release in .*expected one integer"),
         ({"grasp": 9}, "grasp is 9; expected a whole number from -4 to 3"),
         ({"grasp": 3, "release": 1}, "expected the grasp first"),
-        ({"schema": 4}, "has schema 4; expected 1 to 3"),
+        ({"schema": 2, "grasp": 1}, "has no array release; expected points, wxyz_xyz, query, grasp, release"),
+        ({"schema": 4, "grasp": 0, "release": 1}, "has schema 4; expected 1 to 3"),
         ({"contact_query": np.zeros((4, 3))}, "has a target, but of its arrays only contact_query"),
     ],
 )
