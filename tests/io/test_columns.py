@@ -267,3 +267,42 @@ def test_damaged_files_say_where(tmp_path, name):
     (tmp_path / "cloud.xyz").write_text(content)
     with pytest.raises(InputError, match=rf"load_points\(\): .*cloud.xyz .*({message})"):
         load_points(tmp_path / "cloud.xyz")
+
+
+NUMBERS = {"5f": (1, "{:.5f}"), "e": (1, "{:.6e}"), "g": (1, "{:.4g}"), "mm": (1000, "{:.0f}"), "mm1": (1000, "{:.1f}")}
+BEFORE = {
+    "nothing": (),
+    "from zero": (index,),
+    "from one": (index_from_one,),
+    "gaps": (lambda i: str(3 * i + 10),),
+    "label": (lambda i: str(i % 4),),
+    "one label": ("1",),
+    "time": (lambda i: f"{i * 0.033:.3f}",),
+    "colour": ("10", "200", "30"),
+}
+BEHIND = {"nothing": (), "colour": COLOUR, "normal": NORMAL, "intensity": ("0.5",), "one": ("1",), "word": ("mug",)}
+
+
+def test_any_mixture_of_dialects_is_right_or_refused(tmp_path):
+    """Never wrong, and without a column before x and decimal commas among commas hardly ever refused."""
+    rng, refused, plain = np.random.default_rng(0), 0, 0
+    for _ in range(150):
+        factor, number = NUMBERS[rng.choice(list(NUMBERS))]
+        delimiter, decimal = rng.choice([" ", "  ", "\t", ",", ", ", ";", "; ", " ,"]), rng.choice([".", ","])
+        before, behind = BEFORE[rng.choice(list(BEFORE))], BEHIND[rng.choice(list(BEHIND))]
+        names = delimiter.join([*(f"a{i}" for i in range(len(before))), *"xyz", *(f"b{i}" for i in range(len(behind)))])
+        head = rng.choice(["", f"{names}\n", f"# {names}\n", "40\n", "40\nscan of a mug\n", f"40\n{names}\n"])
+        rows = [[number.format(x * factor) for x in point] for point in CLOUD]
+        content = text(delimiter, head, before, behind, rows, decimal=decimal)
+        (tmp_path / "cloud.xyz").write_text(content)
+        clear = before == () and not ("," in delimiter and (decimal == "," or behind == COLOUR))
+        plain += clear
+        try:
+            points = load_points(tmp_path / "cloud.xyz", scale=1 / factor)
+        except InputError as error:
+            assert not clear, f"{error}\n{content[:200]}"
+            refused += 1
+            continue
+        expected = np.array(rows, float) / factor
+        np.testing.assert_allclose(points, expected, atol=1e-6, err_msg=content[:200])
+    assert plain >= 8 and refused < 75
