@@ -23,6 +23,7 @@ _HARMLESS = (
     *("EXT_feature_metadata", "EXT_mesh_manifold", "CESIUM_primitive_outline", "FB_geometry_metadata"),
     *("MSFT_texture", "MSFT_lod", "MSFT_packing", "ADOBE_materials", "NV_materials"),
 )
+_MOST_ZEROS = 10**7  # rows of an accessor without data, whose number nothing in the file bounds
 _COMPRESSED = "export it without compression of meshes"
 
 
@@ -211,6 +212,8 @@ class _Asset:
         kind, width, count = np.dtype(_COMPONENTS[entry["componentType"]]), _WIDTHS[entry["type"]], entry["count"]
         if "bufferView" in entry:
             values = self.rows(entry["bufferView"], entry.get("byteOffset", 0), kind, width, count)
+        elif not 0 <= count <= _MOST_ZEROS:
+            raise ValueError(f"accessor {index} has {count} rows and no data")
         else:
             values = np.zeros((count, width), kind)
         if "sparse" in entry:

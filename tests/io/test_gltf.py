@@ -467,6 +467,10 @@ DAMAGED = {
         edited(lambda d, p: d["accessors"][0].update(count=9)),
         "is shorter than the 9 rows of 12 bytes",
     ),
+    "rows without data": (
+        edited(lambda d, p: d.update(accessors=[{"componentType": FLOAT, "type": "VEC3", "count": 10**12}])),
+        "accessor 0 has 1000000000000 rows and no data",
+    ),
     "negative offset": (
         edited(lambda d, p: d["accessors"][0].update(byteOffset=-4)),
         "offsets, lengths or strides that are not",
