@@ -47,7 +47,7 @@ def convert_checkpoint(path: str | os.PathLike, name: str | None = None, prefix:
         InputError: the file is of another kind or damaged, holds no such network or several, or the network is of
             another architecture.
     """
-    path = checks.existing_file("convert_checkpoint()", path)
+    path = checks.path("convert_checkpoint()", path)
     try:
         with opened(path) as file:
             config, params = _convert(file, prefix)

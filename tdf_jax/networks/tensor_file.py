@@ -97,10 +97,11 @@ def opened(path: Path) -> Iterator[TensorFile]:
 
 def _kind(path: Path) -> str:
     """Find out what kind of file it is, and refuse those that cannot be read with what to do about them."""
-    if path.is_dir():
-        raise Refusal(_folder(path))
-    if not path.is_file():
-        raise Refusal("there is no such file; check the path")
+    with _file_errors():  # of a name that is too long
+        if path.is_dir():
+            raise Refusal(_folder(path))
+        if not path.is_file():
+            raise Refusal("there is no such file; check the path")
     with _file_errors(), path.open("rb") as file:
         start = file.read(512)
     if start.startswith(b"PK\x03\x04"):
