@@ -4,7 +4,8 @@ import json
 
 import numpy as np
 import pytest
-from conftest import random_cloud, random_poses
+from conftest import carried, composed, random_cloud, random_poses
+from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
 from tdf_jax.cli.main import main
@@ -64,6 +65,57 @@ def test_the_file_is_imitated(files, weights, capsys):
     assert len(poses) == 9 and record["demonstration"] | {"grasp": 3, "release": 6} == record["demonstration"]
     np.testing.assert_allclose(record["goal"], poses[6], atol=1e-6)
     assert any(np.allclose(mode["pick"], poses[3], atol=1e-6) for mode in record["modes"])
+
+
+def test_the_goal_is_found_on_a_second_object(files, weights, capsys):
+    motion = composed(POSES[6], inverse(POSES[3])[None])[0]
+    released = carried(motion, CLOUD)
+    shelf = random_cloud(7, 60) - random_cloud(7, 60).mean(axis=0) + released.mean(axis=0) + [0, 0, -0.15]
+    np.save(files / "shelf.npy", shelf)
+    call(files, **{"target-object": files / "shelf.npy", "contacts": 8})
+    demo = tdf.load_demonstration(files / "demo.npz")
+    np.testing.assert_allclose(demo.target.points, shelf, atol=1e-6)
+    assert np.abs(np.mean(demo.target.query, axis=0) - (released.mean(axis=0) + [0, 0, -0.075])).max() < 0.06
+
+    np.save(files / "new.npy", random_cloud(3))
+    np.save(files / "new_shelf.npy", shelf + [0.5, 0.5, 0.0])
+    words = ["imitate", "--demonstration", files / "demo.npz", "--target", files / "new.npy", "--weights", weights]
+    words += ["--num-starts", "8", "--out", files / "result", "--target-object", files / "new_shelf.npy"]
+    main([*map(str, words)])
+    assert "object moves" in capsys.readouterr().out
+    record = json.loads((files / "result" / "result.json").read_text())
+    poses = np.asarray(tdf.load_trajectory(files / "result" / "trajectory.npz").wxyz_xyz, float)
+    pick = next(mode["pick"] for mode in record["modes"])
+    expected = composed(record["relation"]["object_motion"], np.array([pick]))[0]
+    goal = np.array(record["goal"])
+    np.testing.assert_allclose(goal[4:], expected[4:], atol=1e-4)
+    assert abs(goal[:4] @ expected[:4]) > 1 - 1e-5
+    assert np.abs(poses - goal).max(axis=1).min() < 1e-5 and (files / "result" / "imitation.png").exists()
+    for extra, message in (
+        (["--goal-offset", "0", "0", "0.1"], "goal_offset, and the demonstration has a target"),
+        (["--method", "adam"], "config is OptimizeConfig, and the demonstration has a target"),
+    ):
+        with pytest.raises(SystemExit):
+            main([*map(str, words), *extra])
+        assert message in capsys.readouterr().err
+
+
+def inverse(pose):
+    turn = Rotation.from_quat(pose[:4], scalar_first=True).inv()
+    return np.concatenate([turn.as_quat(scalar_first=True), -turn.apply(pose[4:])])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--target-object", "shelf.npy"], "--target-object needs a --demonstration with a target"),
+        (["--target-weights", "mug"], "--target-weights is for a --target-object"),
+    ],
+)
+def test_options_of_a_target_need_one(capsys, words, message):
+    with pytest.raises(SystemExit) as end:
+        main(["imitate", *words])
+    assert end.value.code == 2 and message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
