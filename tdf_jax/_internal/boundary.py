@@ -6,7 +6,7 @@ import functools
 import inspect
 import itertools
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar, cast
 
 import jax
@@ -51,7 +51,7 @@ def public(function: F) -> F:
 def host(function: F) -> F:
     """Decorator of a public function that cannot be a part of a traced one, because it runs programs of its own.
 
-    As `public`, but a call inside of `jax.jit` is refused before anything is computed.
+    As `public`, but a call inside of `jax.jit`, or with traced numbers, is refused before anything is computed.
     """
     return _guarded(function, host=True)
 
@@ -67,7 +67,9 @@ def _guarded(function: F, host: bool) -> F:
         try:
             with own_settings():
                 arguments, keywords = _plain(function, name, arguments, keywords)
-                if host and isinstance(jnp.zeros(()), jax.core.Tracer):
+                if host and any(
+                    isinstance(one, jax.core.Tracer) for one in _leaves([arguments, keywords, jnp.zeros(())])
+                ):
                     raise InputError(f"{name}: {_traced(function, arguments, keywords)}")
                 return function(*arguments, **keywords)
         except InputError:
@@ -127,6 +129,8 @@ def plain_array(function: str, name: str, value) -> np.ndarray:
         if len(named) == 3 == len(value.columns):
             value = value[sorted(named, key=lambda column: str(column).lower())]
         return np.asarray(value)
+    except _UNKNOWN_NUMBERS:
+        raise
     except Exception as error:  # every library raises its own
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(
@@ -175,7 +179,7 @@ def _traced(function, arguments: tuple, keywords: dict) -> str:
 
 def _leaves(value) -> Iterable[Any]:
     """Arrays of a value; dataclasses that are no pytrees, such as `Demonstration`, are looked into."""
-    for leaf in jax.tree.leaves(value):
+    for leaf in jax.tree.leaves(value, is_leaf=lambda part: isinstance(part, Iterator)):
         if dataclasses.is_dataclass(leaf) and not isinstance(leaf, type):
             for field in dataclasses.fields(leaf):
                 yield from _leaves(getattr(leaf, field.name))

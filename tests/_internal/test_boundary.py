@@ -220,6 +220,11 @@ def test_known_numbers_inside_a_traced_function():
     np.testing.assert_array_equal(jax.vmap(lambda x: hosted(np.ones(3)) * x)(jnp.ones(2)), [3, 3])
 
 
+def test_iterators_arrive_unread():
+    assert list(host(lambda clouds: clouds)(iter([1, 2]))) == [1, 2]
+    assert next(values(iter([3]))["x"]) == 3
+
+
 def test_the_outermost_function_is_named():
     outer = public(lambda x: summed(x))
     with pytest.raises(InputError, match=r"<lambda>\(\): x is traced"):
