@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tdf_jax._internal.boundary import is_foreign, plain_array
+from tdf_jax._internal.boundary import plain_array
 from tdf_jax._internal.errors import InputError
 
 SEEDS = 2**32  # jax truncates a larger seed to 32 bits without a warning
@@ -170,11 +170,12 @@ def coordinates(
 
 def pose(function: str, name: str, value: ArrayLike) -> ArrayLike:
     """Check that a value is one finite pose `wxyz_xyz` with a unit quaternion, near the origin; return it."""
-    value = plain_array(function, name, value) if is_foreign(value) else value
+    if not isinstance(value, jax.Array):
+        value = _native(numbers(function, name, value), value)
     if np.shape(value) != (7,):
         raise InputError(f"{function}: {name} has shape {np.shape(value)}; expected one pose wxyz_xyz, (7,)")
     if not traced(value):
-        values = numbers(function, name, value)
+        values = np.asarray(value, np.float64)
         if not np.isfinite(values).all():
             raise InputError(f"{function}: {name} is {values.tolist()}; expected one finite pose wxyz_xyz")
         unit_quaternions(function, name, values[None])
@@ -360,19 +361,23 @@ def _transposed(shape: tuple[int, ...]) -> str:
 
 
 def query(function: str, value) -> ArrayLike:
-    """Check that a value is query points (queries, 3), at least one, finite; return it."""
-    value = plain_array(function, "query", value) if is_foreign(value) else value
+    """Check that a value is query points (queries, 3), at least one, finite; return it as an array."""
+    if not isinstance(value, jax.Array):
+        value = _native(numbers(function, "query", value), value)
     shape = np.shape(value)
     if len(shape) != 2 or shape[1] != 3 or shape[0] < 1:
         raise InputError(
             f"{function}: query points have shape {shape}; expected (queries, 3). Try tdf.box_query(key, count=500)"
         )
-    if not traced(value):
-        if np.asarray(value).dtype.kind not in "fiu" and not jnp.issubdtype(np.asarray(value).dtype, np.floating):
-            raise InputError(f"{function}: query points are {np.asarray(value).dtype}; expected numbers, metres")
-        if not np.isfinite(np.asarray(value)).all():
-            raise InputError(f"{function}: some query points are NaN or infinite; expected finite metres")
+    if not traced(value) and not np.isfinite(np.asarray(value)).all():
+        raise InputError(f"{function}: some query points are NaN or infinite; expected finite metres")
     return value
+
+
+def _native(numbers: np.ndarray, given) -> np.ndarray:
+    """The array that was given if JAX takes it as it is, otherwise its numbers in float64."""
+    takes = isinstance(given, np.ndarray) and given.dtype.isnative and given.dtype.kind in "fV"
+    return given if takes else numbers
 
 
 def _in_words(size: int) -> str:
@@ -402,7 +407,7 @@ def numbers(function: str, name: str, value) -> np.ndarray:
     """Check that a value is an array of real numbers; return it as float64."""
     try:
         array = plain_array(function, name, value)
-        if array.dtype.kind in "cmM":  # complex numbers and dates would become other numbers
+        if array.dtype.kind in "cmMSU":  # complex numbers and dates would become other numbers, and so would text
             raise TypeError
         return np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):

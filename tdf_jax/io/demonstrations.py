@@ -1,7 +1,6 @@
 """Demonstrations in files: one .npz file of named arrays."""
 
 import os
-import zipfile
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -85,7 +84,7 @@ def load_demonstration(path: str | os.PathLike) -> Demonstration:
         with path.open("rb") as file, np.lib.npyio.NpzFile(file, allow_pickle=False) as archive:
             names = (*ARRAYS, *INDICES, *TARGET_ARRAYS, "schema")
             arrays = {name: archive[name] for name in names if name in archive}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+    except Exception as error:  # damaged archives raise errors of many kinds
         raise InputError(f"load_demonstration(): {path} cannot be read as .npz ({error}); save it again") from None
     expected = (*ARRAYS, *INDICES) if "schema" in arrays else ARRAYS
     absent = ", ".join(name for name in expected if name not in arrays)
@@ -101,8 +100,8 @@ def load_demonstration(path: str | os.PathLike) -> Demonstration:
         integers[name] = int(arrays[name])
     if not 1 <= integers["schema"] <= TARGET_SCHEMA:
         raise InputError(
-            f"load_demonstration(): {path} has schema {arrays['schema']}; expected 1 to {TARGET_SCHEMA}. Use the tdf_jax that "
-            "wrote it, or a newer one"
+            f"load_demonstration(): {path} has schema {arrays['schema']}; expected 1 to {TARGET_SCHEMA}. Use the "
+            "tdf_jax that wrote it, or a newer one"
         )
     given = [name for name in TARGET_ARRAYS if name in arrays]
     if given and len(given) < len(TARGET_ARRAYS):

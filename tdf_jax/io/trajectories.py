@@ -1,7 +1,6 @@
 """Trajectories in files: .npz, the text format of TUM, and .csv with named columns."""
 
 import re
-import zipfile
 from pathlib import Path
 from typing import BinaryIO
 
@@ -62,7 +61,7 @@ def load_trajectory(path: str | Path) -> Trajectory:
         wxyz_xyz = _READERS[path.suffix.lower()](path)
     except _Dialect as reason:
         raise InputError(f"load_trajectory(): {path} is not read: {reason}") from None
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+    except Exception as error:  # damaged archives raise errors of many kinds
         raise InputError(
             f"load_trajectory(): {path} cannot be read as {path.suffix} ({error}); save it again"
         ) from error
