@@ -10,6 +10,9 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.training.dataset import Recipe, build, load
 
 
+MOST_WORKERS = 1024
+
+
 def dataset(
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")],
     workers: Annotated[int, tyro.conf.arg(help_behavior_hint="(default: one for every core)")] = 0,
@@ -22,8 +25,10 @@ def dataset(
         workers: number of processes.
         recipe: settings of the data set.
     """
-    if workers < 0:
-        raise InputError(f"tdf dataset: --workers is {workers}; expected 1 or more, or 0 for one for every core")
+    if not 0 <= workers <= MOST_WORKERS:
+        raise InputError(
+            f"tdf dataset: --workers is {workers}; expected 1 to {MOST_WORKERS}, or 0 for one for every core"
+        )
     build(recipe, out, workers or os.cpu_count() or 1)
     parts = load(out)
     for name, data in zip(("training", "validation"), parts):

@@ -117,7 +117,10 @@ def _check_size(settings, waypoints, count) -> None:
     )
     points = math.prod(float(side) / settings.pitch + 1 for side in sides[: 2 if settings.grid in PLANES else 3])
     needed = points * NUMBER * 2 * count * 2  # energies and rotations, unfinished and finished
-    parent = settings.out.resolve().parent
+    try:
+        parent = settings.out.resolve().parent
+    except (OSError, RuntimeError, ValueError) as error:  # a link to itself, a name that cannot be one
+        raise InputError(f"tdf landscape: --out {settings.out} is no place ({error}); expected a new folder") from None
     free = shutil.disk_usage(parent).free if parent.is_dir() else math.inf
     if needed > free:
         raise InputError(

@@ -9,6 +9,7 @@ import tyro
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
+from tdf_jax.cli.dataset import MOST_WORKERS
 from tdf_jax.cli.pictures import Pictures
 from tdf_jax.networks.checkpoint import SUFFIX, load_model, save_model
 from tdf_jax.networks.model import Model, ModelInfo
@@ -52,9 +53,9 @@ def train(
     """
     if minutes is not None:
         checks.positive("tdf train", "--minutes", minutes)
-    if workers < 0:
+    if not 0 <= workers <= MOST_WORKERS:
         raise InputError(
-            f"tdf train: --workers is {workers}; expected 1 or more, or 0 for as many as suit this machine"
+            f"tdf train: --workers is {workers}; expected 1 to {MOST_WORKERS}, or 0 for as many as suit this machine"
         )
     workers = workers or usual_workers()
     target = _target(out, weights)

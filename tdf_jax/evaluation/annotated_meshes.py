@@ -153,7 +153,7 @@ def _entries(folder: Path, recursive: bool) -> dict:
 def _sidecar(path: Path) -> dict:
     try:
         entries = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"load_annotated(): {path} cannot be read as JSON ({error}); {EXPECTED}; correct it") from None
     if not isinstance(entries, dict) or not entries:
         got = "no entry" if entries == {} else f"a JSON {type(entries).__name__}"

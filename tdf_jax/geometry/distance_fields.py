@@ -234,12 +234,13 @@ def grid_nodes(function: str, points: np.ndarray, pitch: float, pad: float) -> F
     checks.positive(function, "pitch", pitch, "metres")
     checks.positive(function, "pad", pad, "metres")
     low, high = points.min(axis=0) - pad, points.max(axis=0) + pad
-    counts = np.ceil((high - low) / pitch - 1e-6).astype(int) + 1
-    if np.prod(counts, dtype=float) > MAX_NODES:
+    counts = np.ceil((high - low) / pitch - 1e-6) + 1
+    if not np.prod(counts) <= MAX_NODES:  # before it is an integer, which may be too small for it
         raise InputError(
-            f"{function}: the grid has {' x '.join(map(str, counts))} nodes at a pitch of {pitch} m; "
+            f"{function}: the grid has {' x '.join(f'{count:.0f}' for count in counts)} nodes at a pitch of {pitch} m; "
             f"expected at most {MAX_NODES} nodes; raise pitch, or remove distant points"
         )
+    counts = counts.astype(int)
     return np.stack(np.meshgrid(*(low[i] + pitch * np.arange(counts[i]) for i in range(3)), indexing="ij"), axis=-1)
 
 

@@ -17,6 +17,7 @@ PLANES = ("xy", "xz", "yz")
 ORTHONORMAL_TOLERANCE = 1e-6
 # Tolerance of even steps, relative to the largest coordinate; float32 rounds to 6e-8.
 EVEN_TOLERANCE = 1e-6
+MAX_POINTS = 100_000_000  # points of the box around a path, 2.4 GB
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -70,7 +71,10 @@ class Grid:
             ):
                 raise InputError(f"Grid(): the steps of the {name} axis differ; expected even ones, as of np.linspace")
         axes = tuple(np.linspace(steps[0], steps[-1], len(steps)) for steps in axes)
-        mask = None if self.mask is None else np.asarray(self.mask)
+        try:
+            mask = None if self.mask is None else np.asarray(self.mask)
+        except ValueError:  # rows of different lengths
+            mask = np.empty(0, object)
         if mask is not None and mask.dtype != bool:
             raise InputError(f"Grid(): mask has type {mask.dtype}; expected one boolean for each point")
         for name, value in (("origin", origin), ("directions", directions), ("coordinates", axes), ("mask", mask)):
@@ -188,7 +192,8 @@ def path_grid(
         The grid; its mask selects the points within the radius.
 
     Raises:
-        InputError: radius or step is not above 0, step is above the radius, or the path is not finite corners.
+        InputError: radius or step is not above 0, step is above the radius, the path is not finite corners, or the box
+            around it has too many points.
     """
     corners = path.translations if isinstance(path, Trajectory) else path
     corners = np.asarray(checks.coordinates("path_grid()", "path", corners, "poses"), dtype=float)
@@ -197,11 +202,16 @@ def path_grid(
     if not step <= radius:
         raise InputError(f"path_grid(): step is {step} and radius {radius}; expected 0 < step <= radius, metres")
     axes = np.eye(3) if axes is None else _numbers("path_grid()", "axes", axes)
-    if axes.shape != (3, 3):
-        raise InputError(f"path_grid(): axes have shape {axes.shape}; expected three vectors (3, 3)")
+    if axes.shape != (3, 3) or not np.isfinite(axes).all():
+        raise InputError(f"path_grid(): axes are {axes.tolist()}; expected three perpendicular unit vectors (3, 3)")
     along = (corners - corners[0]) @ axes.T / step
     low, high = along.min(axis=0), along.max(axis=0)
     reach = radius / step
+    if not np.prod(high - low + 2 * reach + 1) <= MAX_POINTS:
+        raise InputError(
+            f"path_grid(): with a step of {step} m and a radius of {radius} m the grid has more than {MAX_POINTS} "
+            "points; expected fewer; raise the step, or lower the radius"
+        )
     coordinates = tuple(step * np.arange(np.ceil(a - reach), np.floor(b + reach) + 1) for a, b in zip(low, high))
     grid = Grid(corners[0], axes, coordinates)
     near = distance_from_polyline(grid.points.reshape(-1, 3), corners) <= radius

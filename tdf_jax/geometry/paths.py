@@ -273,6 +273,7 @@ PATHS = SHAPES | {"lift_over": lift_over, "tilt_and_pour": tilt_and_pour, "hang_
 def _along_polyline(function: str, num_poses: int, translations: list, rotations: list) -> Trajectory:
     """Poses evenly spaced by length along the polyline of key poses; rotations follow the geodesic on each piece."""
     checks.count(function, "num_poses", num_poses, least=2)
+    checks.near(function, "path", np.stack(translations))
     return resample(Trajectory(se3.pose(jnp.stack(rotations), jnp.asarray(np.stack(translations)))), num_poses)
 
 
@@ -305,6 +306,7 @@ def _along_curve(
     fractions = np.linspace(0, 1, num_poses)
     along, across = curve(fractions, chord)
     translations = start + along[:, None] * forward + across[:, None] * side
+    checks.near(function, "path", translations)
     return Trajectory(se3.pose(se3.geodesic(R_start, R_end, fractions), jnp.asarray(translations)))
 
 

@@ -122,6 +122,11 @@ def farthest_point_indices(points: Float[np.ndarray, "points 3"], count: int) ->
     checks.count("thin()", "count", count)
     if len(points) <= count:
         return np.arange(len(points))
+    if points.dtype.kind == "f" and np.abs(points).max() > np.sqrt(np.finfo(points.dtype).max) / 4:
+        raise InputError(
+            f"thin(): points has coordinates of up to {np.abs(points).max():.3g} m, whose squares are no numbers of "
+            f"type {points.dtype}; expected metres"
+        )
     x, y, z = np.ascontiguousarray((points - points.mean(axis=0)).T)  # columns: five times faster than rows
     distance = x * x + y * y + z * z
     indices = np.empty(count, dtype=np.int64)

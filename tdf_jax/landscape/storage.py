@@ -65,6 +65,8 @@ class Landscape:
         for name, expected in (("waypoints", (len(self.waypoints), 3)), ("rotations", (len(self.rotations), 3, 3))):
             if np.shape(getattr(self, name)) != expected:
                 raise InputError(f"Landscape(): {name} have shape {getattr(self, name).shape}; expected {expected}")
+        if not np.isfinite(checks.numbers("Landscape()", "waypoints", self.waypoints)).all():
+            raise InputError("Landscape(): waypoints are NaN or infinite; expected finite positions, metres")
         checks.rotations("Landscape()", "rotations", self.rotations)
         if self.turned is not None:
             _check_turned(self.turned, shape, len(self.rotations))
@@ -232,7 +234,7 @@ def load_landscape(path: str | os.PathLike) -> tuple[Landscape, dict]:
         raise
     except Exception as error:  # a damaged archive raises errors of many kinds
         raise InputError(
-            f"load_landscape(): cannot read {path} ({error}); expected a file from save_landscape"
+            f"load_landscape(): cannot read {path} ({str(error)[:200]}); expected a file from save_landscape"
         ) from None
 
 

@@ -65,7 +65,7 @@ def restore(directory: Path, params, state) -> tuple:
     if not path.exists():
         return params, state, 0
     target = {"params": params, "state": state, "step": 0}
-    saved = jax.tree.map(jnp.asarray, _read(path, lambda content: serialization.from_bytes(target, content)))
+    saved = _read(path, lambda content: jax.tree.map(jnp.asarray, serialization.from_bytes(target, content)))
     shapes = [[leaf.shape for leaf in jax.tree.leaves(tree)] for tree in (target["params"], saved["params"])]
     if shapes[0] != shapes[1]:
         raise InputError(

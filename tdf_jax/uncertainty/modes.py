@@ -66,15 +66,13 @@ def cluster_poses(
     Source:
         Leader clustering (Hartigan, "Clustering Algorithms", 1975, ch. 3), in the order of the energies.
     """
+    for name, value in (("wxyz_xyz", wxyz_xyz), ("energies", energies)):
+        checks.numbers("cluster_poses()", name, value)
     poses, values = np.asarray(wxyz_xyz), np.asarray(energies)
     if poses.ndim != 2 or poses.shape[1] != 7 or values.shape != poses.shape[:1]:
         raise InputError(
             f"cluster_poses(): poses have shape {poses.shape} and energies {values.shape}; expected (candidates, 7) "
             "and (candidates,). Take one waypoint of each candidate, such as result.trajectories[:, 0]"
-        )
-    if poses.dtype.kind not in "fiu" or values.dtype.kind not in "fiu":
-        raise InputError(
-            f"cluster_poses(): poses have type {poses.dtype} and energies {values.dtype}; expected numbers"
         )
     checks.number("cluster_poses()", "angle", angle, least=0, unit="radians")
     checks.number("cluster_poses()", "distance", distance, least=0, unit="metres")

@@ -107,7 +107,7 @@ def _judged(case, caught):
 FUNCTION = re.compile(r"(tdf( [a-z]+)?|[A-Za-z_.]+\(\))[: ]")
 WORDS = (
     "expected use save check give drop remove multiply subtract copy choose delete invert add re-save run rename train "
-    "convert compute correct lower raise move reduce keep repair divide free write put transpose restore"
+    "must download convert compute correct lower raise move reduce keep repair divide free write put transpose restore"
 )
 FIX = re.compile(rf"\b({'|'.join(WORDS.split())})\b", re.IGNORECASE)
 
