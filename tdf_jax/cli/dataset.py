@@ -9,7 +9,6 @@ import tyro
 from tdf_jax._internal.errors import InputError
 from tdf_jax.training.dataset import Recipe, build, load
 
-
 MOST_WORKERS = 1024
 
 
@@ -27,7 +26,8 @@ def dataset(
     """
     if not 0 <= workers <= MOST_WORKERS:
         raise InputError(
-            f"tdf dataset: --workers is {workers}; expected 1 to {MOST_WORKERS}, or 0 for one for every core"
+            f"tdf dataset: --workers is {workers}; expected 1 or more, or 0 for one for every core, and "
+            f"at most {MOST_WORKERS}"
         )
     build(recipe, out, workers or os.cpu_count() or 1)
     parts = load(out)

@@ -55,7 +55,8 @@ def train(
         checks.positive("tdf train", "--minutes", minutes)
     if not 0 <= workers <= MOST_WORKERS:
         raise InputError(
-            f"tdf train: --workers is {workers}; expected 1 to {MOST_WORKERS}, or 0 for as many as suit this machine"
+            f"tdf train: --workers is {workers}; expected 1 or more, or 0 for as many as suit this "
+            f"machine, and at most {MOST_WORKERS}"
         )
     workers = workers or usual_workers()
     target = _target(out, weights)
