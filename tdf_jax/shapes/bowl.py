@@ -159,7 +159,10 @@ def _check(p: BowlParameters) -> None:
         p.radius + min(p.rim_flare, 0) > p.base_radius + p.wall_thickness,
         "base_radius leaves no room for the wall: lower it",
     )
-    need(p.foot_height + p.bottom_thickness + p.lip_radius < 0.6 * p.height, "the bottom is too thick for the height")
+    need(
+        p.foot_height + p.bottom_thickness + p.lip_radius < 0.6 * p.height,
+        "the bottom is too thick for the height: lower it",
+    )
     need(p.foot_height == 0 or p.foot_width < 0.8 * p.base_radius, "foot_width leaves no recess: lower it")
     need(
         p.wall_thickness < 0.25 * p.radius * p.aspect,

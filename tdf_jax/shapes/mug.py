@@ -215,7 +215,7 @@ def _check(parameters: MugParameters) -> None:
     need(1 <= p.handle_flare <= 2, f"handle_flare is {p.handle_flare}; expected 1 to 2")
     need(2 * p.lip_radius < p.wall_thickness, "lip_radius must be less than half of wall_thickness")
     floor = p.foot_height + p.bottom_thickness
-    need(floor + _inner_edge(p) + p.lip_radius < p.height, "the bottom is too thick for the height")
+    need(floor + _inner_edge(p) + p.lip_radius < p.height, "the bottom is too thick for the height: lower it")
     need(p.edge_radius + p.lip_radius < p.height, "edge_radius is too large for the height")
     levels = np.linspace(0, 1, 65) * p.height
     need(np.min(_wall(p, levels)) > p.wall_thickness, "wall_thickness must be less than the radius at every height")

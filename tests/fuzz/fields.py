@@ -29,7 +29,7 @@ def hostile_cloud(rng, points):
     rows = rng.choice(count, int(rng.integers(2, 15)), replace=False)
     spoilt, sentinel = points.astype(float), points.astype(float)
     spoilt[rows[0], int(rng.integers(3))] = one_of(rng, [np.nan, np.inf])
-    sentinel[rows] = one_of(rng, [[0, 0, 0], [-1, -1, -1]])
+    sentinel[rows] = one_of(rng, [[0, 0, 0], [-1, -1, -1]][: 2 if len(rows) > 2 else 1])
     options = {
         "permuted": (points[rng.permutation(count)], "same"),
         "not finite": (spoilt, "refused"), "a sentinel": (sentinel, "refused"), "transposed": (points.T, "refused"),

@@ -259,7 +259,8 @@ def cloud_content(rng, world: World, folder):
     spoilt, sentinel = points.copy(), points.copy()
     rows = rng.choice(len(points), int(rng.integers(2, 15)), replace=False)
     spoilt[rows[0], int(rng.integers(3))] = one_of(rng, [np.nan, np.inf, -np.inf])
-    sentinel[rows] = one_of(rng, [[0, 0, 0], [0, 0, 0], [-1, -1, -1], [9.99, 9.99, 9.99]])
+    # Twice the origin is no measurement; of other values, two may be a duplicate.
+    sentinel[rows] = one_of(rng, [[0, 0, 0], [0, 0, 0], [-1, -1, -1], [9.99, 9.99, 9.99]][: 4 if len(rows) > 2 else 2])
     labels = np.column_stack([rng.integers(0, 4, len(points)), points])
     turned = np.column_stack([good.poses(5, 40)[:, 4:], good.poses(5, 40)[:, :4]])
     arrays = {
