@@ -130,7 +130,8 @@ def test_the_record_tells_all_settings(folder, weights):
     record = record_of(folder)
     assert (record["schema"], record["tdf_jax"], record["seed"]) == (report.SCHEMA, tdf.__version__, 0)
     assert record["settings"] == {
-        "target": None, "scale": 1.0, "target_pose": "random", "demonstration": None, "category": "mug",
+        "target": None, "scale": 1.0, "drop_invalid": False, "target_object": None, "target_weights": None,
+        "target_pose": "random", "demonstration": None, "category": "mug",
         "trajectory": "wave",
         "goal_offset": [0.0, 0.0, 0.0], "k": None, "method": "adam", "num_starts": 3, "num_poses": 4, "queries": 8,
         "iterations": 3, "points": 60,
@@ -303,7 +304,7 @@ def test_an_own_demonstration(imitate, tmp_path, poses, words):
     demonstration = tdf.Demonstration(points, tdf.line(num_poses=poses), tdf.box_query(jax.random.key(0), 8))
     save_demonstration(tmp_path / "demo.npz", demonstration)
     record = imitate("--demonstration", tmp_path / "demo.npz", *QUICK, *words)
-    assert record["demonstration"] == {"points": 70, "poses": 4, "queries": 8}
+    assert record["demonstration"] == {"points": 70, "poses": 4, "grasp": 0, "release": -1, "queries": 8}
     assert record["errors"] is None
     goal = demonstration.trajectory.wxyz_xyz[-1, 4:] - points.mean(axis=0)
     assert np.linalg.norm(goal - np.array(record["goal"])[4:]) < 1  # carried from one centroid to the other

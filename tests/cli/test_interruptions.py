@@ -280,6 +280,18 @@ def test_an_error_of_the_system_is_a_line(command, capsys):
 SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "terminated, because"}
 
 
+@pytest.fixture
+def default_handlers():
+    """As of a command in a terminal; a test run in the background ignores some, and a command respects that."""
+    before = {one: signal.getsignal(one) for one in SIGNALS}
+    for one in SIGNALS:
+        signal.signal(one, signal.default_int_handler if one == signal.SIGINT else signal.SIG_DFL)
+    yield
+    for one, handler in before.items():
+        signal.signal(one, handler)
+
+
+@pytest.mark.usefixtures("default_handlers")
 @pytest.mark.parametrize("number", SIGNALS)
 @pytest.mark.parametrize("hidden", [False, True])
 def test_a_signal_cleans_up(command, tmp_path, capsys, number, hidden):
