@@ -69,6 +69,10 @@ def cluster_poses(
     for name, value in (("wxyz_xyz", wxyz_xyz), ("energies", energies)):
         checks.numbers("cluster_poses()", name, value)
     poses, values = np.asarray(wxyz_xyz), np.asarray(energies)
+    if {poses.dtype.kind, values.dtype.kind} & set("OSU"):  # objects such as None, and text
+        raise InputError(
+            f"cluster_poses(): poses have type {poses.dtype} and energies {values.dtype}; expected numbers"
+        )
     if poses.ndim != 2 or poses.shape[1] != 7 or values.shape != poses.shape[:1]:
         raise InputError(
             f"cluster_poses(): poses have shape {poses.shape} and energies {values.shape}; expected (candidates, 7) "
