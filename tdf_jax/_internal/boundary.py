@@ -20,7 +20,8 @@ from tdf_jax._internal.errors import InputError
 F = TypeVar("F", bound=Callable)
 
 # Settings with which callers find mistakes in their own code: values that leave the library alone, and the context that
-# sets the first of them. `jax_debug_nans` is not among them: results without NaN are a promise of the library.
+# sets the first of them. `jax_debug_nans` is not among them: no computation of the library produces a NaN. NaN in a
+# result is written from the host and means unknown.
 _OWN_SETTINGS = {
     "jax_numpy_rank_promotion": (("allow",), jax.numpy_rank_promotion),
     "jax_numpy_dtype_promotion": (("standard",), jax.numpy_dtype_promotion),
@@ -178,7 +179,7 @@ def _traced(function, arguments: tuple, keywords: dict) -> str:
 
 
 def _leaves(value) -> Iterable[Any]:
-    """Arrays of a value; dataclasses that are no pytrees, such as `Demonstration`, are looked into."""
+    """Arrays of a value; dataclasses that are no pytrees, such as `Demonstration`, are searched too."""
     for leaf in jax.tree.leaves(value, is_leaf=lambda part: isinstance(part, Iterator)):
         if dataclasses.is_dataclass(leaf) and not isinstance(leaf, type):
             for field in dataclasses.fields(leaf):

@@ -34,7 +34,7 @@ class SceneSettings:
     """A demonstration and a new object, from files or generated.
 
     Attributes:
-        target: mesh or point cloud of the new object.
+        target: mesh or point cloud of the new object; the second object is --target-object.
         scale: metres per unit of the target file, such as 0.01 for centimetres.
         drop_invalid: remove points of the target file that are NaN or stand for missing measurements.
         target_pose: pose of the target in the world: that of its file, or a random rotation and translation of it.

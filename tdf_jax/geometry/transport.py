@@ -9,8 +9,11 @@ from tdf_jax._internal.boundary import public
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.trajectory import Trajectory, check_trajectory
 
-# Metres of the path that repeat the demonstration after the pick and before the goal.
+# Metres of the path that repeat the demonstration after the pick and before the goal. There the gripper touches the object
+# and the object meets the target, so that the demonstrated motion matters; the arrival is longer, because the object has
+# to come down a peg or into a container as demonstrated.
 DEPARTURE, ARRIVAL = 0.05, 0.08
+MAX_ENDS = 0.8  # largest share of the path that both take: the rest blends the two, without a jump between poses
 
 
 @public
@@ -72,8 +75,8 @@ def carry_to_target(
         target_motion: motion B of the target from the demonstration, `wxyz_xyz`, (7,): a point x of the demonstrated
             target is at B x on the new one. In the frame of `demonstrated`.
         departure: length of the path that repeats the demonstration after the pick, metres.
-        arrival: length of the path that repeats the demonstration before the goal, metres. Of a path that is shorter
-            than both, each part is shortened in proportion.
+        arrival: length of the path that repeats the demonstration before the goal, metres. Together the two
+            take at most 80 % of the path; otherwise both are shortened in proportion.
 
     Returns:
         The warped path, T_world_query, with as many poses.
@@ -87,7 +90,7 @@ def carry_to_target(
     steps = jnp.linalg.norm(jnp.diff(poses[:, 4:], axis=0), axis=1)
     length = jnp.concatenate([jnp.zeros(1, steps.dtype), jnp.cumsum(steps)])
     total = jnp.maximum(length[-1], 1e-9)
-    share = jnp.minimum(1.0, 0.8 * total / (departure + arrival))
+    share = jnp.minimum(1.0, MAX_ENDS * total / (departure + arrival))
     begin, end = share * departure, total - share * arrival
     s = jnp.clip((length - begin) / (end - begin), 0.0, 1.0)
     s = s * s * (3 - 2 * s)

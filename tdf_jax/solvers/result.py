@@ -46,7 +46,8 @@ def _unknown() -> np.ndarray:
 )
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
 class Result:
-    """Result of any solver. Every field but the two indices is an array; unknown values are NaN.
+    """Result of any solver. Every field but the indices `grasp` and `release` is an array; unknown values are NaN.
+    The indices are static, because they select rows.
 
     `optimize` keeps every start to the end, so its candidates are its starts. `solve` and `carry` follow many starts on
     a few query points, drop most of them, and refine the best distinct candidates on all query points.

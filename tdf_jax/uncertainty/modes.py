@@ -50,7 +50,7 @@ def cluster_poses(
     candidates along that direction are modes of their own, with equal energies.
 
     Args:
-        wxyz_xyz: poses T_world_query, such as the picks `result.trajectories[:, 0]`, (candidates, 7), metres.
+        wxyz_xyz: poses T_world_query, such as `result.picks`, (candidates, 7), metres.
         energies: energies of the candidates, such as `result.energies`, (candidates,).
         angle: largest rotation between a member and the pose of its mode, radians.
         distance: largest distance between a member and the pose of its mode, metres.
@@ -76,7 +76,7 @@ def cluster_poses(
     if poses.ndim != 2 or poses.shape[1] != 7 or values.shape != poses.shape[:1]:
         raise InputError(
             f"cluster_poses(): poses have shape {poses.shape} and energies {values.shape}; expected (candidates, 7) "
-            "and (candidates,). Take one waypoint of each candidate, such as result.trajectories[:, 0]"
+            "and (candidates,). Take one pose of each candidate, such as result.picks"
         )
     checks.number("cluster_poses()", "angle", angle, least=0, unit="radians")
     checks.number("cluster_poses()", "distance", distance, least=0, unit="metres")

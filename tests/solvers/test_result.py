@@ -88,7 +88,7 @@ def test_it_prints_a_summary():
     assert f"xyz ({x}, {y}, {z}) m" in words
     assert "0.10000 (others: 0.20000, 0.30000)" in words and "6, 3 final candidates" in words
     assert "0.93 that the pick is right" in words and "recognised  unknown" in words
-    modes = tdf.cluster_poses(result.trajectories[:, 0], result.energies)
+    modes = tdf.cluster_poses(result.picks, result.energies)
     assert f"{len(modes)} distinct picks" in words
     page = result._repr_html_()
     assert page.startswith("<table>") and page.count("<tr>") == len(words.splitlines()) - 1
