@@ -18,7 +18,7 @@ from tdf_jax.energy.reference import Reference, describe
 from tdf_jax.geometry.demonstration import Demonstration, require_apart
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.model import Model
-from tdf_jax.relation import carry_object, referenced, target_field
+from tdf_jax.relation import carry_object, reference_of, target_field
 from tdf_jax.solvers.adam import OptimizeConfig, optimize
 from tdf_jax.solvers.initial import default_goal
 from tdf_jax.solvers.multistart import SolveConfig, solve
@@ -61,7 +61,7 @@ def imitate(
         demonstration: one, several with the same query points, or a `Reference` from `describe` to share between calls.
         points: point cloud of the new object, (points, 3), metres, world frame.
         target_points: point cloud of the new target, (points, 3), metres, world frame, if the demonstration has one.
-            Without it the demonstrated target stands where it stood, and the object is placed there.
+            Without it the demonstrated target has not moved, and the object is placed there.
         target_model: network of the targets; by default `model`.
         key: random key, such as `jax.random.key(0)`; the result is a function of it.
         goal: pose at the release, (7,), T_world_query as `wxyz_xyz`; by default, with `fix_last`, the demonstration's,
@@ -96,7 +96,7 @@ def imitate(
             "config=SolveConfig() or OptimizeConfig() with it"
         )
     checks.boolean("imitate()", "fix_last", fix_last)
-    reference = referenced("imitate()", model, demonstration, target_points, target_model)
+    reference = reference_of("imitate()", model, demonstration, target_points, target_model)
     if reference.contact is not None:
         given = {"goal": goal is not None, "goal_offset": goal_offset is not None, "fix_last=False": not fix_last}
         contradicting = ", ".join(name for name, is_given in given.items() if is_given)

@@ -1,8 +1,8 @@
 """Relations: where an object goes on a second object, the target, from the region where the two met in a demonstration.
 
 The region is found twice, by descriptors: on the target as it stands, pose X_t of the contact frame, and on the object
-as it lies, pose X_o. The object's motion M = X_t inverse(X_o) brings the two together. With the demonstrated motion D
-of the object, and the motions A_t of the region on the target and A_o of the region on the object,
+in its initial pose, X_o. The object's motion M = X_t inverse(X_o) brings the two together. With the demonstrated
+motion D of the object, and the motions A_t of the region on the target and A_o of the region on the object,
 M = A_t D inverse(A_o).
 """
 
@@ -32,10 +32,11 @@ from tdf_jax.solvers.pick import CarryConfig, carry
 from tdf_jax.solvers.result import Result, with_ends
 from tdf_jax.uncertainty.modes import cluster_poses
 
-# Folded into the key, so that the pick is the same with and without a target.
+# Folded into the key, so that the pick is the same with and without a target. The numbers are arbitrary, but fixed:
+# results depend on them.
 OBJECT_STREAM, TARGET_STREAM = 0x0B1EC7, 0x7A26E7
-SPACING = 0.01  # metres between the poses of a path to a target: fewer cannot hold the approach
-MAX_POSES = 200
+SPACING = 0.01  # metres between poses to a target: with fewer poses the path would skip the demonstrated approach
+MAX_POSES = 200  # of a path that is made denser; one of more than 2 m has wider spacing, so that results stay small
 MAX_SOLUTIONS = 25  # candidates of a result: distinct picks times distinct motions of the object
 
 
@@ -45,9 +46,9 @@ class Relations:
 
     Attributes:
         target_contacts: poses X_t of the contact frame on the target, world frame, (solutions, 7).
-        object_contacts: poses X_o of the contact frame on the object as it lies, world frame, (solutions, 7).
+        object_contacts: poses X_o of the contact frame on the object in its initial pose, world frame, (solutions, 7).
         energies: sum of the descriptor energies of both, (solutions,).
-        target_residual: residual of the best contact pose on the target; NaN if the target stands where it stood.
+        target_residual: residual of the best contact pose on the target; NaN if the target has not moved.
     """
 
     target_contacts: Float[np.ndarray, "solutions 7"]
@@ -57,7 +58,7 @@ class Relations:
 
     @property
     def motions(self) -> Float[Array, "solutions 7"]:
-        """Motions M of the object: a point x of it as it lies ends at M x."""
+        """Motions M of the object: a point x of it in its initial pose ends at M x."""
         return se3.compose(jnp.asarray(self.target_contacts), se3.inverse(jnp.asarray(self.object_contacts)))
 
 
@@ -78,29 +79,41 @@ def relate(
         model: network of the object.
         demonstration: one with a target, several with the same contact points, or a `Reference` from
             `describe(..., target_model=...)`.
-        points: point cloud of the new object as it lies, (points, 3), metres, world frame.
+        points: point cloud of the new object in its initial pose, (points, 3), metres, world frame.
         target_points: point cloud of the new target, (points, 3), metres, world frame; None if the demonstrated target
-            stands where it stood.
+            has not moved.
         target_model: network of the target; by default `model`.
         key: random key; the result is a function of it.
         config: settings of the search on both objects.
 
     Returns:
-        The motion M of the object, `wxyz_xyz`, (7,), metres, world frame: a point x of it as it lies ends at M x.
+        The motion M of the object, `wxyz_xyz`, (7,), metres, world frame: a point x of the object in its initial
+            pose ends at M x.
 
     Raises:
         InputError: bad clouds, or a demonstration without a target.
     """
     checks.key("relate()", key)
-    reference = referenced("relate()", model, demonstration, target_points, target_model)
+    reference = reference_of("relate()", model, demonstration, target_points, target_model)
     found = find_relations(
         "relate()", encode(model, points), target_field(model, target_points, target_model), reference, key, config
     )
     return found.motions[0]
 
 
-def referenced(function: str, model: Model, demonstration, target_points, target_model: Model | None) -> Reference:
+def reference_of(function: str, model: Model, demonstration, target_points, target_model: Model | None) -> Reference:
     """The reference of a demonstration, with the target's side if there is a new target.
+
+    Args:
+        function: name that error messages begin with.
+        model: network of the object.
+        demonstration: a demonstration, several of them, or a `Reference`, which is returned as it is.
+        target_points: point cloud of the new target, (points, 3), metres, world frame; None if the demonstrated one has
+            not moved.
+        target_model: network of the target; by default `model`.
+
+    Returns:
+        The reference.
 
     Raises:
         InputError: a new target, or a network for it, without a demonstrated one.
@@ -123,7 +136,17 @@ def referenced(function: str, model: Model, demonstration, target_points, target
 
 
 def target_field(model: Model, target_points, target_model: Model | None) -> DescriptorField | None:
-    """Field of the new target; None if the target stands where it stood."""
+    """Field of the new target.
+
+    Args:
+        model: network of the object.
+        target_points: point cloud of the new target, (points, 3), metres, world frame; None if the demonstrated one has
+            not moved.
+        target_model: network of the target; by default `model`.
+
+    Returns:
+        The field; None without a new target.
+    """
     return None if target_points is None else encode(model if target_model is None else target_model, target_points)
 
 
@@ -139,8 +162,8 @@ def find_relations(
 
     Args:
         function: name that the messages begin with.
-        field: field of the new object as it lies.
-        target: field of the new target; None if it stands where it stood.
+        field: field of the new object in its initial pose.
+        target: field of the new target; None if it has not moved.
         reference: the demonstration.
         key: random key.
         config: settings of the search.
@@ -213,8 +236,8 @@ def carry_object(
     The pose at the release is M times the pick in every candidate, so that a change of the pick changes it.
 
     Args:
-        field: field of the new object as it lies.
-        target: field of the new target; None if it stands where it stood.
+        field: field of the new object in its initial pose.
+        target: field of the new target; None if it has not moved.
         reference: a demonstration with a target.
         key: random key; the pick is that of `carry` with the same key.
         config: settings of the search for the pick and for the contact region.

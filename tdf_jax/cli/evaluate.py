@@ -7,6 +7,7 @@ import tyro
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
+from tdf_jax.cli.options import Category
 
 if TYPE_CHECKING:
     from tdf_jax.evaluation.pick_report import Outcomes
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 PICTURES = ("reconstructions.png", "transfers.png")
 MOST_GENERATED = 6  # generated objects of a category in a picture
 _NONE = "(default: none)"
-Category = Literal["mug", "bowl", "bottle", "rack", "container"]
 Cloud = Literal[
     "full", "views1", "views2", "views4", "points300", "points1000", "points3000", "noise", "half", "double", "all"
 ]

@@ -315,8 +315,8 @@ def _modes(config, result) -> list[dict] | None:
 
 def _solutions(modes: list[dict]) -> str:
     """How many distinct picks there are, and how far behind the second is."""
-    told = f"{len(modes)} distinct pick{'s' if len(modes) != 1 else ''}"
-    return told if len(modes) < 2 else f"{told}; the second's loss is {modes[1]['energy']:.5f}"
+    words = f"{len(modes)} distinct pick{'s' if len(modes) != 1 else ''}"
+    return words if len(modes) < 2 else f"{words}; the second's loss is {modes[1]['energy']:.5f}"
 
 
 def _plain(value):

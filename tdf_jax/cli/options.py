@@ -21,6 +21,7 @@ from tdf_jax.io.pointclouds import load_points
 from tdf_jax.landscape.shortest_path import SHARPEST
 from tdf_jax.shapes import FAMILIES
 
+Category = Literal["mug", "bowl", "bottle", "rack", "container"]
 MULTI = ("mug", "bowl", "bottle")  # categories that the shipped weights `multi` were trained on
 
 
@@ -56,9 +57,7 @@ class SceneSettings:
         Literal["given", "random"] | None, _option(default="given for a file, random for a generated object")
     ] = None
     demonstration: Annotated[Path | None, _option("FILE", "one on another generated object")] = None
-    category: Annotated[
-        Literal["mug", "bowl", "bottle", "rack", "container"] | None, _option(default="that of shipped weights; mug")
-    ] = None
+    category: Annotated[Category | None, _option(default="that of shipped weights; mug")] = None
     trajectory: Annotated[
         Literal["line", "semicircle", "wave", "lift_over", "tilt_and_pour", "hang_on_rack"] | None,
         _option(default="wave of a mug, lift_over of others"),
@@ -79,7 +78,7 @@ class Settings(SceneSettings):
     Attributes:
         goal_offset: translation that is added to the goal, metres, world frame.
         target_object: mesh or point cloud of the object that the new one is placed on or in, in the unit of --target;
-            the demonstration file must have one too. Without it the demonstrated one stands where it stood.
+            the demonstration file must have one too. Without it the demonstrated one has not moved.
         target_weights: a name of shipped weights, or a .safetensors file, for --target-object.
         k: weight of the correlation term of eq. 3, for the methods that minimise it; the paper's best is 0.02.
         method: carry the demonstration from the pick to the goal; or minimise the paper's energy, eq. 3, by damped

@@ -1,13 +1,15 @@
 """`tdf shapes`: a picture of generated objects, beside meshes of real ones."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
+from tdf_jax.cli.options import Category
+
 
 def shapes(
-    category: Literal["mug", "bowl", "bottle", "rack", "container"],
+    category: Category,
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")],
     count: int = 24,
     seed: int = 0,

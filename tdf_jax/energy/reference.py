@@ -41,7 +41,7 @@ class Contact:
         query: contact points, (queries, 3), metres, contact frame.
         object_descriptors: descriptors of the region in the object's field, (queries, channels).
         target_descriptors: descriptors of the region in the target's field, (queries, channels); None if the target
-            was not encoded, because it stands where it stood.
+            was not encoded, because it has not moved.
         T_object_contact: pose of the contact frame on the object before the grasp, relative to the centroid of its
             cloud, axes of the world, `wxyz_xyz`, (7,).
         T_target_contact: pose of the contact frame relative to the centroid of the target's cloud, (7,).
@@ -105,7 +105,7 @@ def describe(
             "median", which minimises the sum of absolute differences of eq. 2 (docs/results/benchmark.md compares
             them).
         target_model: network that encodes the targets of the demonstrations, such as `model` itself; None leaves them
-            out, which does for a target that stands where it stood.
+            out, which does for a target that has not moved.
 
     Returns:
         The reference.

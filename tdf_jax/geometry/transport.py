@@ -9,9 +9,8 @@ from tdf_jax._internal.boundary import public
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.trajectory import Trajectory, check_trajectory
 
-# Metres of the path that repeat the demonstration after the pick and before the goal. There the gripper touches the object
-# and the object meets the target, so that the demonstrated motion matters; the arrival is longer, because the object has
-# to come down a peg or into a container as demonstrated.
+# Metres of the path that repeat the demonstration after the pick and before the goal, where the object is close to what
+# it stood on and to the target. The arrival is longer: an object has to move along a peg or into a container.
 DEPARTURE, ARRIVAL = 0.05, 0.08
 MAX_ENDS = 0.8  # largest share of the path that both take: the rest blends the two, without a jump between poses
 

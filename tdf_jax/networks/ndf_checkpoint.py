@@ -21,7 +21,7 @@ from tdf_jax.networks.occupancy import NetworkConfig, parameter_shapes
 from tdf_jax.networks.tensor_file import SAVE, Entry, TensorFile, is_shard, opened
 from tdf_jax.networks.torch_pickle import Refusal
 
-PARTS = ("encoder.", "decoder.")
+NETWORK_PARTS = ("encoder.", "decoder.")
 MOST_NAMED = 5  # prefixes and unknown names in a message
 
 
@@ -127,8 +127,10 @@ def _prefix(file: TensorFile, wanted: str | None) -> str:
 def _network(entries: Mapping[str, Entry], prefix: str) -> dict[str, Entry]:
     """Tensors of encoder and decoder under a prefix, and others beside these in the same dictionary."""
     own = {name.removeprefix(prefix): entry for name, entry in entries.items() if name.startswith(prefix)}
-    containers = {entry.container for name, entry in own.items() if name.startswith(PARTS)}
-    return {name: entry for name, entry in own.items() if name.startswith(PARTS) or entry.container in containers}
+    containers = {entry.container for name, entry in own.items() if name.startswith(NETWORK_PARTS)}
+    return {
+        name: entry for name, entry in own.items() if name.startswith(NETWORK_PARTS) or entry.container in containers
+    }
 
 
 def _nothing(file: TensorFile) -> str:

@@ -1,4 +1,7 @@
-"""The tensors in a file of another program by name: PyTorch's zip files and safetensors; others are told apart."""
+"""Tensors of PyTorch zip files and safetensors files, by name.
+
+The module refuses files of other kinds and names the kind.
+"""
 
 import contextlib
 import dataclasses
@@ -18,7 +21,7 @@ from tdf_jax.networks.torch_pickle import STORAGE_LIMIT, Refusal, Tensor, Unknow
 PICKLE_LIMIT = 2**20  # bytes; that of the published network has 10 kB
 DEPTH = 32  # dictionaries in dictionaries; hostile files have more, and names of unbounded length
 # Attributes of a PyTorch module that hold its parts; its state_dict does not name them.
-PARTS = ("_modules", "_parameters", "_buffers")
+MODULE_ATTRIBUTES = ("_modules", "_parameters", "_buffers")
 RESAVE = (
     'if you trust it, re-save it with PyTorch: torch.save(torch.load(p, map_location="cpu"), new); if it has other '
     "content than tensors, torch.load needs weights_only=False"
@@ -192,7 +195,7 @@ def _tensors(tree: object) -> tuple[dict[str, tuple[int, Tensor | Unusable]], li
         items = list(container.items()) if isinstance(container, dict) else list(enumerate(container))
         inner = []
         for key, value in items:
-            path = keys if isinstance(container, Unknown) and key in PARTS else (*keys, str(key))
+            path = keys if isinstance(container, Unknown) and key in MODULE_ATTRIBUTES else (*keys, str(key))
             if isinstance(value, Tensor | Unusable):
                 found.setdefault(".".join(path), (id(container), value))
             elif isinstance(value, dict | list | tuple) and (value or keys):

@@ -47,6 +47,7 @@ def _unknown() -> np.ndarray:
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
 class Result:
     """Result of any solver. Every field but the indices `grasp` and `release` is an array; unknown values are NaN.
+
     The indices are static, because they select rows.
 
     `optimize` keeps every start to the end, so its candidates are its starts. `solve` and `carry` follow many starts on
@@ -72,7 +73,7 @@ class Result:
         target_trajectories: pose of the contact frame on the target of each candidate, (candidates, 1, 7),
             T_world_contact; no candidates unless the demonstration has a target.
         target_residual: normalised descriptor energy of the contact points on the target, of the best candidate; a
-            scalar, NaN if the target stands where it stood.
+            scalar, NaN if the target has not moved.
         target_confidence: probability that the contact pose on the target is right; a scalar, NaN where it is not
             calibrated.
         grasp: index of the pose at which the object is grasped; poses before it are the approach.
@@ -147,7 +148,7 @@ class Result:
     @property
     @public
     def object_motion(self) -> Float[Array, "*batch 7"]:
-        """Motion of the object from the grasp to the release, `wxyz_xyz`: a point x of it as it lies ends at M x."""
+        """Motion of the object from the grasp to the release, `wxyz_xyz`: a point x in its initial pose ends at M x."""
         return se3.compose(self.goal, se3.inverse(self.pick))
 
     @property
