@@ -62,6 +62,8 @@ class Landscape:
                 f"Landscape(): values have shape {self.values.shape}; expected {each}, or {shape} with the "
                 "index of the best rotation in `turned`"
             )
+        if np.asarray(self.values).dtype.kind not in "fiu":
+            raise InputError(f"Landscape(): values have type {self.values.dtype}; expected energies")
         for name, expected in (("waypoints", (len(self.waypoints), 3)), ("rotations", (len(self.rotations), 3, 3))):
             if np.shape(getattr(self, name)) != expected:
                 raise InputError(f"Landscape(): {name} have shape {getattr(self, name).shape}; expected {expected}")
