@@ -16,7 +16,7 @@ from tdf_jax._internal.boundary import own_settings
 from tdf_jax._internal.devices import platform_problem
 from tdf_jax._internal.errors import InputError, TdfWarning
 from tdf_jax.cli.pictures import PictureError
-from tdf_jax.cli.streams import guarded, lost
+from tdf_jax.cli.streams import guarded, write_failure
 from tdf_jax.landscape.storage import DEPRECATED_REDUCTIONS
 from tdf_jax.paper.setting import DEPRECATED_FIELD_ENERGIES
 
@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         code = _code(sys.argv[1:] if arguments is None else arguments)
         for stream in streams:
             stream.flush()
-        unwritten = lost(streams)
+        unwritten = write_failure(streams)
         if unwritten is not None:
             code = _failed(*unwritten) if not code else code
     if code is not None:

@@ -1,4 +1,4 @@
-"""Optional outputs of a command: a picture or a page that fails costs nothing else."""
+"""Optional outputs of a command: a picture or a page that fails does not stop the command."""
 
 import contextlib
 from collections.abc import Iterator

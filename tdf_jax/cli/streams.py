@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Any, TextIO
 
 PIPE_CODE = 141  # exit code that a shell reports of a tool that ends by SIGPIPE
-CODE = 1
+FAILURE_CODE = 1
 
 
 class Stream:
@@ -25,7 +25,14 @@ class Stream:
         self.error: OSError | None = None
 
     def write(self, text: str) -> int:
-        """Write a text, or drop it."""
+        """Write a text, or drop it.
+
+        Args:
+            text: the text.
+
+        Returns:
+            Number of its characters, also if it is dropped, so that callers go on.
+        """
         if self.error is None:
             try:
                 self._stream.write(text)
@@ -44,7 +51,7 @@ class Stream:
             except OSError as error:
                 self.error = error
 
-    def empty(self) -> None:
+    def drain(self) -> None:
         """Flush; after an error, drop the rest of the buffer, because Python would try to write it at exit."""
         self.flush()
         if self.error is None:
@@ -65,7 +72,7 @@ class Stream:
 
 @contextlib.contextmanager
 def guarded() -> Iterator[tuple[Stream, Stream]]:
-    """Replace standard output and standard error by streams that never raise, and empty both at the end.
+    """Replace standard output and standard error by streams that never raise, and drain both at the end.
 
     Yields:
         The two streams.
@@ -79,8 +86,8 @@ def guarded() -> Iterator[tuple[Stream, Stream]]:
             yield output, messages
         finally:
             sys.stdout, sys.stderr = before
-            output.empty()
-            messages.empty()
+            output.drain()
+            messages.drain()
 
 
 def _open_standard_files() -> None:
@@ -95,15 +102,18 @@ def _open_standard_files() -> None:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
 
 
-def lost(streams: tuple[Stream, Stream]) -> tuple[str, int] | None:
-    """What was not written, as a message, and the exit code for it; None if everything was.
+def write_failure(streams: tuple[Stream, Stream]) -> tuple[str, int] | None:
+    """Find out whether something could not be written.
 
     Args:
         streams: standard output and standard error of `guarded`.
+
+    Returns:
+        A message that says what was not written, and the exit code for it; None if everything was written.
     """
     for stream, name in zip(streams, ("output", "messages")):
         if stream.error is not None and stream.error.errno == errno.EPIPE:
-            return f"the {name} ended early, because nobody read on", PIPE_CODE
+            return f"the {name} ended early, because the reader closed the pipe", PIPE_CODE
         if stream.error is not None:
-            return f"error: the {name} could not be written ({stream.error.strerror or stream.error})", CODE
+            return f"error: the {name} could not be written ({stream.error.strerror or stream.error})", FAILURE_CODE
     return None

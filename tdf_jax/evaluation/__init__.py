@@ -11,7 +11,6 @@ Modules:
     clearance_study: colliding paths in random scenes, pushed clear
     conditions: complete, partial, sparse and noisy clouds
     demonstration_count: picks from several demonstrations
-    mesh_folder: meshes in a folder and its subfolders
     metrics: errors of poses and paths
     path_methods: methods that imitate a whole trajectory
     path_report: page and record of `tdf benchmark`

@@ -28,10 +28,10 @@ from jaxtyping import Bool, Float
 from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.axis_profiles import profile, profile_places
-from tdf_jax.evaluation.mesh_folder import deeper, file_names, is_mesh, warn_of_deeper
 from tdf_jax.evaluation.places import body, measured_places
 from tdf_jax.geometry.symmetry import FOLDS
 from tdf_jax.geometry.winding import inside
+from tdf_jax.io.mesh_folder import file_names, is_mesh, subfolder_hint, warn_of_subfolders
 from tdf_jax.io.meshes import AXES, file_axes, load_mesh
 from tdf_jax.shapes import FAMILIES
 
@@ -109,8 +109,8 @@ def _entries(folder: Path, recursive: bool) -> dict:
             "path"
         )
     files = file_names("load_annotated()", folder, recursive)
-    hint = "" if recursive else deeper("load_annotated()", folder)
-    hint = hint and f"; {hint}, if they have entries"
+    hint = "" if recursive else subfolder_hint("load_annotated()", folder)
+    hint = hint and f". The folder {hint}, if they have entries"
     if not files and not hint:
         raise InputError(
             f"load_annotated(): the folder {folder} is empty; expected meshes and their {SIDECAR}; put them there"
@@ -146,7 +146,7 @@ def _entries(folder: Path, recursive: bool) -> dict:
             "rename one"
         )
     if not recursive and not any("/" in name for name in entries):
-        warn_of_deeper("load_annotated()", folder)
+        warn_of_subfolders("load_annotated()", folder)
     return entries
 
 

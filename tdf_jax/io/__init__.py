@@ -6,6 +6,7 @@ Modules:
     content: bytes of files, and the errors of what cannot be read
     demonstrations: demonstrations as .npz
     gltf: scenes in .glb and .gltf
+    mesh_folder: meshes in a folder and its subfolders
     meshes: meshes in files of every format
     obj: polygons in .obj
     off: polygons in .off

@@ -21,9 +21,9 @@ from tdf_jax._internal import checks
 from tdf_jax._internal.cache import digest
 from tdf_jax._internal.errors import InputError, SizeWarning
 from tdf_jax._internal.files import replace_file
-from tdf_jax.evaluation.mesh_folder import deeper, file_names, is_mesh, warn_of_deeper
 from tdf_jax.geometry.symmetry import FOLDS
 from tdf_jax.geometry.winding import libigl
+from tdf_jax.io.mesh_folder import file_names, is_mesh, subfolder_hint, warn_of_subfolders
 from tdf_jax.io.meshes import MESH_SUFFIXES, file_axes
 from tdf_jax.shapes import FAMILIES
 from tdf_jax.training import workers as processes
@@ -296,13 +296,13 @@ def _mesh_files(recipe) -> dict[str, list[Path]]:
     names = file_names("tdf dataset", folder, recipe.recursive) if folder.is_dir() else []
     files = [folder / name for name in names if is_mesh(name)]
     if len(files) < 2:
-        hint = deeper("tdf dataset", folder) if folder.is_dir() and not recipe.recursive else ""
+        hint = subfolder_hint("tdf dataset", folder) if folder.is_dir() and not recipe.recursive else ""
         raise InputError(
             f"tdf dataset: {folder} holds {len(files)} mesh files; expected a folder of at least two "
-            f"({', '.join(MESH_SUFFIXES)}), aligned, of one category{hint and '; ' + hint}"
+            f"({', '.join(MESH_SUFFIXES)}), aligned, of one category{hint and '. The folder ' + hint}"
         )
     if not recipe.recursive:
-        warn_of_deeper("tdf dataset", folder)
+        warn_of_subfolders("tdf dataset", folder)
     held_out = max(1, len(files) // HELD_OUT)
     files = [files[index] for index in np.random.default_rng(recipe.seed).permutation(len(files))]
     return {"training": files[held_out:], "validation": files[:held_out]}

@@ -180,7 +180,7 @@ def unbuffered():
 STREAMS = {
     "full": (full, 1, "error: the {} could not be written (No space left on device)"),
     "unbuffered": (unbuffered, 1, "error: the {} could not be written (No space left on device)"),
-    "unread": (unread, 141, "the {} ended early, because nobody read on"),
+    "unread": (unread, 141, "the {} ended early, because the reader closed the pipe"),
 }
 
 

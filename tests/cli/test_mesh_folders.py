@@ -1,4 +1,4 @@
-"""Every command that takes a folder of meshes says how many lie deeper, and reads them with --recursive."""
+"""Every command that takes a folder of meshes says how many are in subfolders, and reads them with --recursive."""
 
 import pytest
 
@@ -26,7 +26,7 @@ def test_nested_meshes(tmp_path, capsys, command):
         assert ended.value.code == 2
         return capsys.readouterr().err
 
-    assert "2 meshes lie deeper: add --recursive" in refusal()
+    assert "has 2 meshes in subfolders, which are not used; add --recursive" in refusal()
     found = refusal("--recursive")
-    assert "deeper" not in found
+    assert "in subfolders" not in found
     assert "a1/model_normalized.obj" in found if command == "dataset" else "has no meshes.json" in found

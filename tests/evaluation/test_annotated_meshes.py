@@ -479,9 +479,9 @@ def test_folders_of_folders(folder, tmp_path):
 def test_meshes_below_are_counted_where_they_are_not_read(folder, tmp_path):
     (tmp_path / "more").mkdir()
     build_bowl().mesh.export(tmp_path / "more" / "a.obj")
-    with pytest.raises(InputError, match=r"has no meshes.json; .*; 1 mesh lies deeper: add --recursive, .*, if they"):
+    with pytest.raises(InputError, match=r"has no meshes.json; .*\. The folder has 1 mesh in subfolders, .*, if they"):
         load_annotated(tmp_path)
-    with pytest.warns(TdfWarning, match="1 mesh lies deeper: add --recursive"):
+    with pytest.warns(TdfWarning, match="has 1 mesh in subfolders, which is not used; add --recursive"):
         (found,) = load_annotated(folder({"my.obj": build_bowl().mesh}, {"my.obj": BOWL}))
     assert found.name == "my"
 

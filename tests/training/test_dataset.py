@@ -268,7 +268,9 @@ def test_meshes_nested_as_shapenets_are_found_with_recursive(meshes, tmp_path):
         (nested / "03797390" / f"a{index}" / "models").mkdir(parents=True)
         file.rename(nested / "03797390" / f"a{index}" / "models" / "model_normalized.obj")
     (nested / "03797390" / "a0" / "all").symlink_to(nested, target_is_directory=True)
-    with pytest.raises(InputError, match=r"nested holds 0 mesh files; .*; 4 meshes lie deeper: add --recursive"):
+    with pytest.raises(
+        InputError, match=r"nested holds 0 mesh files; .*\. The folder has 4 meshes in subfolders, .*; add --recursive"
+    ):
         quiet_build(scanned_recipe(nested), tmp_path / "data")
     recipe = scanned_recipe(nested, recursive=True)
     quiet_build(recipe, tmp_path / "data")
@@ -287,7 +289,9 @@ def test_meshes_beside_used_ones_are_not_left_out_in_silence(meshes, tmp_path):
     pytest.importorskip("igl")
     (meshes / "more").mkdir()
     (meshes / "more" / "mug9.obj").write_bytes((meshes / "mug1.obj").read_bytes())
-    with pytest.warns(TdfWarning, match="tdf dataset: of .*meshes, 1 mesh lies deeper: add --recursive"):
+    with pytest.warns(
+        TdfWarning, match="tdf dataset: .*meshes has 1 mesh in subfolders, which is not used; add --recursive"
+    ):
         quiet_build(scanned_recipe(meshes), tmp_path / "data")
 
 

@@ -34,17 +34,27 @@ def file_names(function: str, folder: Path, recursive: bool) -> list[str]:
 
 
 def is_mesh(name: str) -> bool:
-    """Whether the name of a file is that of a mesh; macOS keeps data of its own in files that begin with `._`."""
+    """Whether the name of a file is that of a mesh.
+
+    Args:
+        name: name or path of the file.
+
+    Returns:
+        True for the suffix of a mesh format, unless the name begins with `._`: macOS keeps data of its own there.
+    """
     last = Path(name).name
     return Path(last).suffix.lower() in MESH_SUFFIXES and not last.startswith("._")
 
 
-def deeper(function: str, folder: Path) -> str:
-    """What to do about meshes in subfolders, as the end of a message; empty if there are none.
+def subfolder_hint(function: str, folder: Path) -> str:
+    """What to do about meshes in subfolders.
 
     Args:
         function: name that error messages begin with.
         folder: existing folder.
+
+    Returns:
+        The hint, as the end of a message about the folder; empty if there are no meshes in subfolders.
     """
     count, complete = 0, True
     with contextlib.suppress(InputError):  # a hint needs no folder that cannot be read
@@ -56,14 +66,20 @@ def deeper(function: str, folder: Path) -> str:
     if not count:
         return ""
     number = f"{'' if complete else 'at least '}{count}"
-    return f"{number} {'mesh lies' if count == 1 else 'meshes lie'} deeper: add --recursive, or recursive=True"
+    meshes = "mesh in subfolders, which is" if count == 1 else "meshes in subfolders, which are"
+    return f"has {number} {meshes} not used; add --recursive, or recursive=True"
 
 
-def warn_of_deeper(function: str, folder: Path) -> None:
-    """Warn that meshes in subfolders are not used."""
-    hint = deeper(function, folder)
+def warn_of_subfolders(function: str, folder: Path) -> None:
+    """Warn that meshes in subfolders are not used.
+
+    Args:
+        function: name that the warning begins with.
+        folder: existing folder.
+    """
+    hint = subfolder_hint(function, folder)
     if hint:
-        warnings.warn(f"{function}: of {folder}, {hint}, to use them", TdfWarning, stacklevel=caller_level())
+        warnings.warn(f"{function}: {folder} {hint}", TdfWarning, stacklevel=caller_level())
 
 
 def _folders(function: str, folder: Path) -> Iterator[list[str]]:

@@ -5,10 +5,11 @@ import os
 import pytest
 
 from tdf_jax._internal.errors import InputError, TdfWarning
-from tdf_jax.evaluation import mesh_folder
-from tdf_jax.evaluation.mesh_folder import deeper, file_names, is_mesh, warn_of_deeper
+from tdf_jax.io import mesh_folder
+from tdf_jax.io.mesh_folder import file_names, is_mesh, subfolder_hint, warn_of_subfolders
 
 NESTED = ("02876657/a1/models/model_normalized.obj", "02876657/a1/models/model_normalized.mtl", "02876657/b2/x.OBJ")
+HINT = "has 1 mesh in subfolders, which is not used; add --recursive, or recursive=True"
 
 
 @pytest.fixture
@@ -48,13 +49,16 @@ def test_links_are_followed_and_circles_end(folder, tmp_path):
 
 
 def test_the_hint_counts_the_meshes_below(folder, tmp_path, monkeypatch):
-    assert deeper("f()", folder) == "3 meshes lie deeper: add --recursive, or recursive=True"
-    assert deeper("f()", folder / "02876657" / "a1") == "1 mesh lies deeper: add --recursive, or recursive=True"
-    assert deeper("f()", folder / "02876657" / "b2") == ""
-    with pytest.warns(TdfWarning, match=r"f\(\): of .*meshes, 3 meshes lie deeper: .*, to use them"):
-        warn_of_deeper("f()", folder)
+    assert (
+        subfolder_hint("f()", folder)
+        == "has 3 meshes in subfolders, which are not used; add --recursive, or recursive=True"
+    )
+    assert subfolder_hint("f()", folder / "02876657" / "a1") == HINT
+    assert subfolder_hint("f()", folder / "02876657" / "b2") == ""
+    with pytest.warns(TdfWarning, match=r"f\(\): .*meshes has 3 meshes in subfolders, .*; add --recursive, or"):
+        warn_of_subfolders("f()", folder)
     monkeypatch.setattr(mesh_folder, "MOST_FOLDERS", 3)  # the search of a whole disk ends too
-    assert deeper("f()", folder) == "at least 1 mesh lies deeper: add --recursive, or recursive=True"
+    assert subfolder_hint("f()", folder) == HINT.replace("1", "at least 1")
 
 
 def test_a_folder_that_cannot_be_read_is_named(folder, monkeypatch):
@@ -68,4 +72,4 @@ def test_a_folder_that_cannot_be_read_is_named(folder, monkeypatch):
     monkeypatch.setattr(os, "scandir", refusing)
     with pytest.raises(InputError, match=r"f\(\): cannot read the folder .*b2 \(Permission denied\); expected"):
         file_names("f()", folder, True)
-    assert deeper("f()", folder).startswith("1 mesh lies deeper")  # of those that can be read before it
+    assert subfolder_hint("f()", folder).startswith("has 1 mesh in subfolders")  # of those that can be read before it
