@@ -5,7 +5,7 @@ import io
 import numpy as np
 from jaxtyping import Float
 
-from tdf_jax.io.columns import MOST_COLUMNS, coordinate_columns, named_columns
+from tdf_jax.io.columns import MOST_COLUMNS, check_unit, coordinate_columns, named_columns
 from tdf_jax.io.content import UnsupportedError
 
 _NAMES = ("points", "xyz", "pointcloud", "point_cloud", "cloud", "pc", "coords", "coordinates", "position", "positions")
@@ -13,11 +13,12 @@ _QUERIES = {"occupancies", "occupancy", "sdf"}  # beside them, points are sample
 _LEAST_SIDE = 20  # of an organised cloud; a batch of clouds is mostly smaller
 
 
-def read_npy(data: bytes) -> Float[np.ndarray, "points 3"]:
+def read_npy(data: bytes, scale: float = 1.0) -> Float[np.ndarray, "points 3"]:
     """Read the points of an .npy file, as `array_points` takes them.
 
     Args:
         data: content of the file.
+        scale: metres per unit of the file, to be compared with a unit that the names of fields tell.
 
     Returns:
         Point cloud, (points, 3), float64, in the unit and frame of the file.
@@ -31,14 +32,15 @@ def read_npy(data: bytes) -> Float[np.ndarray, "points 3"]:
         array = np.lib.format.read_array(stream, allow_pickle=False)
     if stream.tell() != len(data):
         raise UnsupportedError("holds more than one array; expected one; save it as .npz with the array points")
-    return array_points(array)
+    return array_points(array, scale)
 
 
-def read_npz(data: bytes) -> Float[np.ndarray, "points 3"]:
+def read_npz(data: bytes, scale: float = 1.0) -> Float[np.ndarray, "points 3"]:
     """Read the points of an .npz file: its array `points`, its only one, or the one with a usual name such as xyz.
 
     Args:
         data: content of the file.
+        scale: metres per unit of the file, to be compared with a unit that the names of fields tell.
 
     Returns:
         Point cloud, (points, 3), float64, in the unit and frame of the file.
@@ -60,14 +62,14 @@ def read_npz(data: bytes) -> Float[np.ndarray, "points 3"]:
                 array = arrays[name]
             if not isinstance(array, np.ndarray):
                 raise UnsupportedError(f"holds {name}, which is no array; expected an array named points")
-            return array_points(array)
+            return array_points(array, scale)
     raise UnsupportedError(
         f"holds the arrays {names}; expected one named points, or a single one; "
         f"np.savez(path, points=np.load(path)[{(names or ['points'])[0]!r}]) saves one of them"
     )
 
 
-def array_points(array: np.ndarray) -> Float[np.ndarray, "points 3"]:
+def array_points(array: np.ndarray, scale: float = 1.0) -> Float[np.ndarray, "points 3"]:
     """Take the points from an array, if it is clear which numbers they are.
 
     Args:
@@ -75,6 +77,7 @@ def array_points(array: np.ndarray) -> Float[np.ndarray, "points 3"]:
             (3, points); (4, points) with a last row of ones; one of these with further axes of length 1;
             (height, width, 3 or more), if neighbours in both directions are near each other; or an array with the
             fields x, y and z.
+        scale: metres per unit of the array, to be compared with a unit that the names of fields tell.
 
     Returns:
         Point cloud, (points, 3), float64.
@@ -83,7 +86,7 @@ def array_points(array: np.ndarray) -> Float[np.ndarray, "points 3"]:
         UnsupportedError: it is not clear which numbers are points.
     """
     if array.dtype.names:
-        return _fields(array)
+        return _fields(array, scale)
     if array.dtype.kind not in "fiu":
         raise UnsupportedError(f"has numbers of type {array.dtype}; expected floats; save points.astype(np.float64)")
     values = array.astype(np.float64)
@@ -123,12 +126,13 @@ class _no_objects:
             ) from None
 
 
-def _fields(array):
+def _fields(array, scale):
     names = array.dtype.names
     found = named_columns(names)
     if found:
         columns = [array[names[column]].ravel() for column in found[0]]
         if all(column.dtype.kind in "fiu" and column.size == array.size for column in columns):
+            check_unit(found[1], scale)
             return np.stack(columns, axis=1).astype(np.float64)
     for name in names:
         if name.lower() in _NAMES and array.dtype[name].shape == (3,) and array.dtype[name].base.kind in "fiu":
@@ -141,9 +145,18 @@ def _organised(values):
     if shape[0] == 3 and not 3 <= shape[2] <= 12:
         values = np.moveaxis(values, 0, -1)
     if not 3 <= values.shape[2] <= 12 or min(values.shape[:2]) < _LEAST_SIDE or not _is_surface(values[..., :3]):
+        if shape[2] <= 12:
+            fix = f"points.reshape(-1, {shape[2]})[:, :3] if it is one cloud, in rows and columns, or points[0] for"
+        elif 3 <= shape[1] <= 12:
+            fix = (
+                "points[:, :3].transpose(0, 2, 1).reshape(-1, 3) if it is one cloud, in pieces, or points[0, :3].T for"
+            )
+        elif 3 <= shape[0] <= 12:
+            fix = "points[:3].reshape(3, -1).T if it is one cloud, in rows and columns, or points[:3, 0].T for"
+        else:
+            raise UnsupportedError(f"has shape {shape}; expected (points, 3); save the x y z of each point, in rows")
         raise UnsupportedError(
-            f"has shape {shape}, which may be several clouds; expected (points, 3); save points.reshape(-1, "
-            f"{shape[2]})[:, :3] if it is one cloud, in rows and columns, or points[0] for the first of several"
+            f"has shape {shape}, which may be several clouds; expected (points, 3); save {fix} the first of several"
         )
     return values[..., :3].reshape(-1, 3)
 

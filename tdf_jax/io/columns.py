@@ -19,6 +19,7 @@ _NAME = re.compile(
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "dm": 1e-1, "m": 1.0, "km": 1e3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 _UNITS |= {"metre": 1.0, "metres": 1.0, "meter": 1.0, "meters": 1.0, "inch": 0.0254, "inches": 0.0254}
 _UNITS |= {"millimetres": 1e-3, "millimeters": 1e-3, "centimetres": 1e-2, "centimeters": 1e-2}
+_NAME_THEM = "or write the names of all columns into the first line of a text, such as x y z r g b"
 _MISSING = {"", "null", "none", "na", "n/a", "-", "--"}
 _MIXED = "has numbers with commas as well as points; expected decimal points only; remove the commas"
 # Six fields without a decimal point are enough for three numbers with decimal commas: 0,12,0,34,0,56.
@@ -87,42 +88,94 @@ def coordinate_columns(values: Float[np.ndarray, "rows columns"]) -> Float[np.nd
     """Take the coordinates from columns without names: the first three, or those behind a column that counts the rows.
 
     Args:
-        values: numbers, (rows, columns). Colours, normals and the like behind the coordinates are left out.
+        values: numbers, (rows, columns). Colours, normals and the like behind the coordinates are left out, and so is
+            a first column that has every number from 0 or 1 on once, in any order.
 
     Returns:
         The coordinates, (rows, 3).
 
     Raises:
         UnsupportedError: there are less than three columns or more than 20, the first may be a number of the point, a
-            time or a label, or the rows are poses.
+            time, a label or a pixel, the first three may be a colour or a normal, or the rows are poses.
     """
-    rows, width = values.shape
+    width = values.shape[1]
     if width < 3:
         raise UnsupportedError(f"has {width} columns; expected x, y and z in each row")
     if width > MOST_COLUMNS:
         raise UnsupportedError(
             f"has {width} columns; expected at most {MOST_COLUMNS}, x y z first; keep the first three"
         )
-    counts = _count_rows(values[:, 0])
     if width == 3:
-        if counts:
+        if _count_rows(values[:, 0]):
             raise UnsupportedError("has a first column that counts the rows, and two more; expected x, y and z")
         return values
-    if counts:
-        return values[:, 1:4]
+    if _number_rows(values[:, 0]):
+        # A scan line in whole millimetres may run down to 0 or 1 as well; numbers in disorder are no coordinates.
+        if (np.diff(values[:, 0]) == -1).all() and all(map(_are_whole, values.T[1:4])):
+            _refuse_first("falling numbers")
+        return values[:, 1:] if width == 4 else coordinate_columns(values[:, 1:])
     if _are_poses(values):
         raise UnsupportedError("has rows that are poses, or quaternions of norm 1; expected points x y z")
-    whole = [np.isfinite(column).all() and (column == np.rint(column)).all() for column in values.T[:4]]
-    rising = [rows > 1 and bool((np.diff(column) > 0).all()) for column in values.T[:4]]
-    values_of = [len(np.unique(column)) for column in values.T[:4]]
-    few = [(whole[0] or values_of[0] == 1) and 4 * values_of[0] <= min(values_of[1:]), False]
-    for flags, kind in ((whole, "whole numbers"), (rising, "rising numbers"), (few, "few different numbers")):
-        if flags[0] and not any(flags[1:]):
-            raise UnsupportedError(
-                f"has a first column of {kind}, unlike those behind it, which may be numbers of the points, times or "
-                "labels; expected x y z first; remove the first column, or all columns behind x y z"
-            )
+    _check_first(values[np.isfinite(values[:, :3]).all(axis=1)])
     return values[:, :3]
+
+
+def _check_first(values):
+    """Refuse columns whose first ones may be something else than x, y and z."""
+    if len(values) < 2:
+        return
+    whole = [_are_whole(column) for column in values.T[:4]]
+    different = [len(np.unique(column)) for column in values.T[:4]]
+    if whole[0] and not (whole[1] and whole[2]):
+        _refuse_first("whole numbers")
+    normals = values.shape[1] >= 6 and _are_unit(values[:, 3:6])
+    if values.shape[1] >= 6:
+        if _are_colours(values[:, :3]) and not _are_colours(values[:, 3:6]) and not normals:
+            _refuse_three("whole numbers from 0 to 255", "colours")
+        if _are_unit(values[:, :3]) and not normals:
+            _refuse_three("norm 1", "normals")
+    steps = np.diff(values[:, 0])
+    if ((steps >= 0).all() or (steps <= 0).all()) and not (normals or _is_fourth_behind(values, whole)):
+        _refuse_first(f"{'few different' if not steps.any() else 'rising' if steps.max() > 0 else 'falling'} numbers")
+    if whole[0] and 4 * different[0] <= sorted(different[1:])[1]:
+        _refuse_first("few different numbers")
+    # Coordinates in whole millimetres repeat; numbers of points do not.
+    if whole[0] and different[0] == len(values) and 4 * max(different[1:]) <= 3 * len(values):
+        _refuse_first("different whole numbers")
+
+
+def _refuse_first(kind):
+    raise UnsupportedError(
+        f"has a first column of {kind}, unlike those behind it, which may be numbers of the points, times or labels; "
+        f"expected x y z first; remove the first column, or all columns behind x y z, {_NAME_THEM}"
+    )
+
+
+def _refuse_three(kind, what):
+    raise UnsupportedError(
+        f"has first three columns of {kind}, unlike those behind them, which may be {what}; expected x y z first; "
+        f"remove what is not x y z, {_NAME_THEM}"
+    )
+
+
+def _are_whole(column):
+    return bool(np.isfinite(column).all() and (column == np.rint(column)).all())
+
+
+def _are_colours(columns):
+    return all(map(_are_whole, columns.T)) and bool((columns >= 0).all() and (columns <= 255).all())
+
+
+def _are_unit(columns):
+    return len(columns) > 0 and bool((np.abs(np.linalg.norm(columns, axis=1) - 1) < 1e-3).all())
+
+
+def _is_fourth_behind(values, whole):
+    """Whether the fourth column cannot be z: it is whole, as colours and intensities are, and those before are not."""
+    if whole[1] or whole[2] or not whole[3]:
+        return False
+    colours = values.shape[1] >= 6 and _are_colours(values[:, 3:6]) and values[:, 3:6].any()
+    return bool(colours or (values[:, 3] != values[0, 3]).any())  # a scanner in one plane has one z
 
 
 def named_columns(names: Sequence[str]) -> tuple[list[int], str | None] | None:
@@ -147,6 +200,23 @@ def named_columns(names: Sequence[str]) -> tuple[list[int], str | None] | None:
     if len(found) < 3 or len(units) > 1:
         return None
     return [found[axis] for axis in "xyz"], units.pop()
+
+
+def check_unit(unit: str | None, scale: float) -> None:
+    """Check that the unit that names of columns tell, if they do, is the one that the caller gives.
+
+    Args:
+        unit: unit of `named_columns`, None for none.
+        scale: metres per unit of the file.
+
+    Raises:
+        UnsupportedError: the two differ.
+    """
+    if unit is None or np.isclose(scale, _UNITS[unit], rtol=1e-6, atol=0.0):
+        return
+    given = "" if scale == 1 else f", and scale is {scale:g}"
+    fix = "leave out scale" if _UNITS[unit] == 1 else f"pass scale={_UNITS[unit]:g}"
+    raise UnsupportedError(f"has coordinates in {unit}, as its names say{given}; {fix}, or correct the names")
 
 
 def _lines(text):
@@ -179,7 +249,10 @@ def _without_count(rows):
     if title and len(rows) - 2 == count:  # a title; names of columns are looked at as those without a count
         return rows[1:] if named_columns(words) else rows[2:]
     if len(rows) - 1 != count:
-        raise ValueError(f"its first line promises {count} points, and {len(rows) - 1 - title} follow")
+        raise UnsupportedError(
+            f"has the count {count} in its first line, and {len(rows) - 1 - title} points follow; expected the same; "
+            "get the rest of the file if points are missing, or correct or remove the first line"
+        )
     return rows[1:]
 
 
@@ -279,8 +352,7 @@ def _named(candidates, width, row_names, scale, required):
         )
     else:
         return None
-    if unit and _UNITS[unit] != 1 and scale == 1:
-        raise UnsupportedError(f"has coordinates in {unit}, as its names say; pass scale={_UNITS[unit]:g}")
+    check_unit(unit, scale)
     return columns
 
 
@@ -293,6 +365,14 @@ def _are_row_names(cells):
 def _count_rows(values):
     """Whether values are the numbers of the rows, from 0 or from 1."""
     return len(values) > 1 and values[0] in {0, 1} and (np.diff(values) == 1).all()
+
+
+def _number_rows(values):
+    """Whether values are the numbers of the rows, from 0 or from 1, in any order."""
+    rows = len(values)
+    if rows < 2 or not _are_whole(values):
+        return False
+    return bool((np.diff(np.sort(values)) == 1).all()) and values.min() in {0, 1}
 
 
 def _values(table, columns, rows):

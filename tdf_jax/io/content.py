@@ -4,6 +4,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float
+
 from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 
@@ -34,6 +37,9 @@ _FOREIGN = {
     b"<!doctype html": ("is a web page", "download the file itself"),
     b"<html": ("is a web page", "download the file itself"),
 }
+
+
+_SPACING = 1e-3  # metres between neighbouring numbers of a file, above which a shape is not what was measured
 
 
 class UnsupportedError(ValueError):
@@ -118,3 +124,31 @@ def file_bytes(path: Path) -> bytes:
         if data.startswith(magic) and suffix != other and {suffix, other} != {".glb", ".gltf"}:
             raise UnsupportedError(f"holds the content of a {other} file; expected {suffix}; rename it to {other}")
     return data
+
+
+def check_spacing(function: str, path: Path, points: Float[np.ndarray, "points 3"], scale: float) -> None:
+    """Refuse points that float32 has rounded to more than 1 mm, as it does in map coordinates.
+
+    Args:
+        function: name that error messages begin with.
+        path: file of the points, for error messages.
+        points: points, (points, 3), finite, in the unit of the file.
+        scale: metres per unit of the file.
+
+    Raises:
+        InputError: all points are float32 numbers, and these are more than 1 mm apart where half of the points are.
+    """
+    with np.errstate(over="ignore"):
+        if not len(points) or (points.astype(np.float32) != points).any():
+            return  # float64 says more, whatever type a header names
+    far = np.median(np.abs(points), axis=0).max()  # not the largest, which may be one wrong measurement
+    step = float(np.spacing(np.float32(far)))
+    if step < 1 and (points == np.rint(points)).all():
+        return  # whole numbers, which float32 holds exactly
+    spacing = step * scale
+    if spacing > _SPACING:
+        raise InputError(
+            f"{function}: {path} stores float32 numbers, which are {spacing:.2g} m apart at its coordinates of "
+            f"{far * scale:.3g} m, so that shapes are lost; expected at most {_SPACING:g} m; export it with doubles "
+            "or relative to an offset near the points, or pass scale if its unit is not metres"
+        )

@@ -22,6 +22,11 @@ _HARMLESS = (
     *("EXT_texture", "EXT_lights", "EXT_mesh_features", "EXT_instance_features", "EXT_structural_metadata"),
     *("EXT_feature_metadata", "EXT_mesh_manifold", "CESIUM_primitive_outline", "FB_geometry_metadata"),
     *("MSFT_texture", "MSFT_lod", "MSFT_packing", "ADOBE_materials", "NV_materials"),
+    # Of documents, scenes and nodes: metadata, sounds, physics, behaviour and what editors note for themselves.
+    *("MOZ_hubs", "MOZ_lightmap", "MSFT_audio", "MSFT_physics", "OMI_audio", "OMI_physics", "OMI_collider", "OMI_seat"),
+    *("OMI_spawn_point", "OMI_link", "OMI_personality", "KHR_physics", "KHR_collision", "KHR_interactivity"),
+    *("KHR_node_hover", "KHR_node_select", "KHR_environment", "AGI_stk_metadata", "GODOT_", "NEEDLE_", "VRMC_vrm"),
+    *("VRMC_materials", "VRMC_springBone", "3DTILES_metadata", "EXT_property"),
 )
 _MOST_ZEROS = 10**7  # rows of an accessor without data, whose number nothing in the file bounds
 _COMPRESSED = "export it without compression of meshes"
@@ -95,6 +100,7 @@ class _Asset:
     def geometry(self):
         """Vertices and faces of the scene."""
         surfaces, clouds = [], []
+        self.check(self.document, "the document")
         for matrix, mesh, weights in self.instances():
             for points, faces in self.primitives(mesh, weights):
                 points = points @ matrix[:3, :3].T + matrix[:3, 3]
@@ -119,7 +125,9 @@ class _Asset:
         """Every mesh that the scene shows: T_scene_mesh, number of the mesh, weights of morph targets or None."""
         scenes, nodes = self.document.get("scenes", []), self.document.get("nodes", [])
         if scenes:
-            roots = self.item("scenes", self.document.get("scene", 0)).get("nodes", [])
+            scene = self.document.get("scene", 0)
+            self.check(self.item("scenes", scene), f"scene {scene}")
+            roots = self.item("scenes", scene).get("nodes", [])
         elif nodes:
             children = {child for node in nodes for child in node.get("children", [])}
             roots = [index for index in range(len(nodes)) if index not in children]
@@ -137,6 +145,7 @@ class _Asset:
             extensions = node.get("extensions", {})
             if not extensions.get("KHR_node_visibility", {}).get("visible", True):
                 continue
+            self.check(node, f"node {index}")
             T_scene_node = T_scene_parent @ _local(node, f"node {index}")
             if "mesh" in node:
                 if "skin" in node:
@@ -189,7 +198,7 @@ class _Asset:
         return values.astype(np.float64)
 
     def check(self, entry, where, accessors=()):
-        """Refuse extensions of what holds geometry, unless they leave it as it is."""
+        """Refuse extensions of what holds or places geometry, unless they leave it as it is."""
         for name in entry.get("extensions", {}):
             if _known(name):
                 continue

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tdf_jax._internal.errors import InputError
-from tdf_jax.io.content import existing_file, file_bytes, reading
+from tdf_jax.io.content import check_spacing, existing_file, file_bytes, reading
 from tdf_jax.io.gltf import read_gltf
 from tdf_jax.io.obj import read_obj
 from tdf_jax.io.off import read_off
@@ -111,7 +111,8 @@ def joined_mesh(
         The mesh, metres.
 
     Raises:
-        InputError: a vertex of a face is not finite, or farther away than vertices can be merged.
+        InputError: a vertex of a face is not finite, farther away than vertices can be merged, or
+            rounded to more than 1 mm.
     """
     import trimesh
 
@@ -125,6 +126,7 @@ def joined_mesh(
             f"{function}: {path} has vertices up to {np.abs(vertices).max():.3g} from the origin; expected at most "
             f"{_FARTHEST:g} units; the file is damaged, or a vertex of it is"
         )
+    check_spacing(function, path, vertices, scale)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.merge_vertices()
     return mesh.apply_scale(scale)

@@ -10,7 +10,7 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.sampling import drop_invalid as without_invalid, sample_surface
 from tdf_jax.io.arrays import read_npy, read_npz
 from tdf_jax.io.columns import read_columns
-from tdf_jax.io.content import existing_file, file_bytes, reading
+from tdf_jax.io.content import check_spacing, existing_file, file_bytes, reading
 from tdf_jax.io.meshes import MESH_SUFFIXES, joined_mesh, read_surface
 from tdf_jax.io.pcd import read_pcd
 
@@ -31,7 +31,7 @@ def load_points(
             faces, .pcd, .npy, .npz with the array `points` or a single array, or text with a point in each line (.xyz,
             .txt, .csv, .asc, .pts). Text and arrays have x y z in their first columns or in those of that name;
             colours, normals and the like behind them are left out, and so is a column before them that counts the
-            rows.
+            rows, in any order.
         count: number of points. A mesh is sampled by area, by default 1500 points. A larger cloud is reduced to a
             random subset in the order of the file, by default all points.
         scale: metres per unit of the file, such as 0.01 for centimetres.
@@ -44,7 +44,8 @@ def load_points(
         move a coordinate by more than 0.01 mm, as in map coordinates.
 
     Raises:
-        InputError: the file is missing, unreadable or of another format, or its points are not a point cloud.
+        InputError: the file is missing, unreadable or of another format, or its points are not a point cloud, or they
+            are float32 numbers so far from the origin that these are more than 1 mm apart.
     """
     function = "load_points()"
     path = existing_file(function, path, MESH_SUFFIXES + CLOUD_SUFFIXES, scale)
@@ -65,7 +66,9 @@ def load_points(
         points = _read_cloud(function, path, scale)
     if drop_invalid:
         points = without_invalid(points)
-    points = checks.points(function, points, str(path)) * scale
+    points = checks.points(function, points, str(path))
+    check_spacing(function, path, points, scale)
+    points = points * scale
     if count is not None and count < len(points):
         points = points[np.sort(rng.choice(len(points), count, replace=False))]
     return _rounded(checks.points(function, points, str(path)))
@@ -76,9 +79,9 @@ def _read_cloud(function, path, scale):
         data = file_bytes(path)
         match path.suffix.lower():
             case ".npy":
-                return read_npy(data)
+                return read_npy(data, scale)
             case ".npz":
-                return read_npz(data)
+                return read_npz(data, scale)
             case ".pcd":
                 return read_pcd(data)
         return read_columns(data, scale)

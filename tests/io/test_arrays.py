@@ -108,6 +108,15 @@ UNSUPPORTED = {
     "six rows": (np.vstack([CLOUD.T, CLOUD.T]), r"has shape \(6, 40\); .* save points\[:3\].T"),
     "four rows": (np.vstack([CLOUD.T, 2 * ONES.T]), r"has shape \(4, 40\); .* save points\[:3\].T"),
     "a batch": (np.stack([CLOUD] * 30), r"has shape \(30, 40, 3\), which may be several clouds; .* points\[0\]"),
+    "a batch of columns": (
+        np.stack([CLOUD.T] * 4),
+        r"has shape \(4, 3, 40\), which may be several clouds; .*transpose\(0, 2, 1\).*points\[0, :3\].T",
+    ),
+    "columns of rows and columns": (
+        CLOUD.T.reshape(3, 2, 20),
+        r"has shape \(3, 2, 20\), which may be several clouds; .* points\[:3\].reshape\(3, -1\).T",
+    ),
+    "a volume": (np.zeros((20, 20, 20)), r"has shape \(20, 20, 20\); expected \(points, 3\); save the x y z"),
     "a batch in another order": (
         np.random.default_rng(0).normal(size=(25, 30, 3)),
         r"\(25, 30, 3\), which may be several",
@@ -151,6 +160,8 @@ FIXES = {
     "flat": "points.reshape(-1, 3)",
     "six rows": "points[:3].T",
     "a batch": "points[0]",
+    "a batch of columns": "points[0, :3].T",
+    "columns of rows and columns": "points[:3].reshape(3, -1).T",
     "words": "points.astype(np.float64)",
     "objects": "np.asarray(points.tolist(), dtype=float)",
 }
@@ -164,6 +175,34 @@ def test_the_fix_of_a_message_is_code_that_works(tmp_path, name):
         load_points(path)
     np.save(path, eval(FIXES[name], {"points": array, "np": np}))
     np.testing.assert_allclose(load_points(path), CLOUD, rtol=1e-6)
+
+
+def test_pieces_of_columns_are_joined_by_the_code_of_the_message(tmp_path):
+    path, pieces = tmp_path / "cloud.npy", np.stack([CLOUD[:20].T, CLOUD[20:].T])
+    fix = "points[:, :3].transpose(0, 2, 1).reshape(-1, 3)"
+    np.save(path, pieces)
+    with pytest.raises(InputError, match=re.escape(fix)):
+        load_points(path)
+    np.save(path, eval(fix, {"points": pieces}))
+    np.testing.assert_array_equal(load_points(path), CLOUD)
+
+
+@pytest.mark.parametrize("suffix", ["npy", "npz"])
+def test_units_of_fields_must_match_the_scale(tmp_path, suffix):
+    path, array = tmp_path / f"cloud.{suffix}", structured(("x_mm", "y_mm", "z_mm"))
+    np.save(path, array) if suffix == "npy" else np.savez(path, points=array)
+    with pytest.raises(InputError, match=r"coordinates in mm, as its names say; pass scale=0.001"):
+        load_points(path)
+    with pytest.raises(InputError, match=r"coordinates in mm, as its names say, and scale is 0.01; pass scale=0.001"):
+        load_points(path, scale=0.01)
+    np.testing.assert_allclose(load_points(path, scale=0.001), CLOUD / 1000, rtol=1e-6)
+
+
+def test_numbers_in_disorder_before_whole_millimetres_are_left_out(tmp_path):
+    millimetres = np.rint(1000 * CLOUD).astype(int)
+    numbers = np.random.default_rng(1).permutation(40)[:, None]
+    np.save(tmp_path / "cloud.npy", np.hstack([numbers, millimetres]))
+    np.testing.assert_allclose(load_points(tmp_path / "cloud.npy", scale=0.001), millimetres / 1000, rtol=1e-6)
 
 
 def test_the_arrays_of_an_npz_must_be_clear(tmp_path):

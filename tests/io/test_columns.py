@@ -8,6 +8,7 @@ from tdf_jax.io.pointclouds import load_points
 
 CLOUD = np.random.default_rng(0).uniform(-0.2, 0.2, (40, 3)).round(4) + 0.00001
 POINTS = [[f"{x:.5f}" for x in point] for point in CLOUD]
+SORTED = sorted(POINTS, key=lambda row: float(row[0]))
 
 
 def text(delimiter=" ", head="", before=(), behind=(), rows=POINTS, end="\n", decimal="."):
@@ -25,6 +26,17 @@ def index(i):
 
 def index_from_one(i):
     return str(i + 1)
+
+
+SHUFFLED = np.random.default_rng(1).permutation(40)
+MILLIMETRES = [[f"{x * 1000:.0f}" for x in point] for point in CLOUD]
+DIRECTIONS = np.random.default_rng(2).normal(size=(40, 3))
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
+NORMALS = tuple(lambda i, axis=axis: f"{DIRECTIONS[i, axis]:.6f}" for axis in range(3))
+
+
+def varying(i):
+    return str(37 * i % 256)
 
 
 COLOUR, NORMAL = ("255", "0", "17"), ("0.0", "0.6", "0.8")
@@ -55,7 +67,15 @@ VALID = {
     "intensity": text(behind=("0.5",)),
     "homogeneous": text(behind=("1",)),
     "words behind": text(behind=("mug",)),
-    "sorted": text(rows=sorted(POINTS, key=lambda row: float(row[0]))),
+    "sorted": text(rows=SORTED),
+    "sorted, colours behind": text(rows=SORTED, behind=COLOUR),
+    "sorted, varying colours behind": text(rows=SORTED, behind=(varying, varying, "0")),
+    "sorted, normals behind": text(rows=SORTED, behind=NORMALS),
+    "sorted, a whole intensity behind": text(rows=SORTED, behind=(varying,)),
+    "varying normals and colours": text(behind=(*NORMALS, varying, "0", varying)),
+    "numbers in disorder": text(before=(lambda i: str(SHUFFLED[i]),)),
+    "numbers in disorder from one, colours behind": text(before=(lambda i: str(SHUFFLED[i] + 1),), behind=COLOUR),
+    "falling numbers": text(before=(lambda i: str(40 - i),)),
     "comments": text(head="# made by a program\n// a cloud\n% more\n", end=" # point\n"),
     "a comment of names": text(head="# x y z nx ny nz\n", behind=NORMAL),
     "a comment of names of CloudCompare": text(head="//X Y Z R G B\n", behind=COLOUR),
@@ -104,7 +124,7 @@ VALID = {
 def test_a_cloud_is_read_in_every_dialect(tmp_path, name):
     content = VALID[name]
     (tmp_path / "cloud.xyz").write_bytes(content if isinstance(content, bytes) else content.encode())
-    expected = sorted(CLOUD, key=lambda row: row[0]) if name == "sorted" else CLOUD
+    expected = sorted(CLOUD, key=lambda row: row[0]) if name.startswith("sorted") else CLOUD
     np.testing.assert_allclose(load_points(tmp_path / "cloud.xyz"), expected, atol=1e-8)
 
 
@@ -125,12 +145,32 @@ def test_whole_millimetres(tmp_path):
     np.testing.assert_allclose(load_points(tmp_path / "cloud.xyz", scale=0.001), millimetres / 1000, atol=1e-8)
 
 
+@pytest.mark.parametrize("first", [0, 1])
+def test_numbers_in_disorder_before_whole_millimetres_are_left_out(tmp_path, first):
+    (tmp_path / "cloud.xyz").write_text(text(before=(lambda i: str(SHUFFLED[i] + first),), rows=MILLIMETRES))
+    expected = np.array(MILLIMETRES, dtype=float) / 1000
+    np.testing.assert_allclose(load_points(tmp_path / "cloud.xyz", scale=0.001), expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("behind", [COLOUR, NORMALS, ("17",), (varying,)])
+def test_whole_millimetres_keep_x_whatever_is_behind(tmp_path, behind):
+    (tmp_path / "cloud.xyz").write_text(text(rows=MILLIMETRES, behind=behind))
+    expected = np.array(MILLIMETRES, dtype=float) / 1000
+    np.testing.assert_allclose(load_points(tmp_path / "cloud.xyz", scale=0.001), expected, atol=1e-8)
+
+
 def test_units_of_names_must_match_the_scale(tmp_path):
     rows = [[f"{x * 1000:.2f}" for x in point] for point in CLOUD]
     (tmp_path / "cloud.csv").write_text(text(",", head="x [mm],y [mm],z [mm]\n", rows=rows))
     with pytest.raises(InputError, match=r"coordinates in mm, as its names say; pass scale=0.001"):
         load_points(tmp_path / "cloud.csv")
     np.testing.assert_allclose(load_points(tmp_path / "cloud.csv", scale=0.001), CLOUD, atol=1e-7)
+    with pytest.raises(InputError, match=r"coordinates in mm, as its names say, and scale is 0.01; pass scale=0.001"):
+        load_points(tmp_path / "cloud.csv", scale=0.01)
+    (tmp_path / "cloud.csv").write_text(text(",", head="x [m],y [m],z [m]\n"))
+    np.testing.assert_allclose(load_points(tmp_path / "cloud.csv"), CLOUD, atol=1e-7)
+    with pytest.raises(InputError, match=r"coordinates in m, as its names say, and scale is 0.001; leave out scale"):
+        load_points(tmp_path / "cloud.csv", scale=0.001)
 
 
 def test_empty_fields_are_missing_measurements(tmp_path):
@@ -220,6 +260,62 @@ UNSUPPORTED = {
     "poses, quaternion last": (text(behind=("0.0", "0.6", "0.0", "0.8")), "rows that are poses"),
     "PTX": (text(head="5\n8\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n"), "single whole numbers in its first lines, as PTX has"),
     "ESRI grid": (text(head="ncols 3\nnrows 40\n"), "first line 'ncols 3'"),
+    "a count of more": (text(head="50\n"), "count 50 in its first line, and 40 points follow; expected the same"),
+    "a count of less": (text(head="30\n"), "count 30 in its first line, and 40 points follow; .* correct"),
+    "a count of less, with a title": (text(head="30\nscan\n"), "count 30 in its first line, and 40 points follow"),
+    "falling numbers before whole millimetres": (
+        text(before=(lambda i: str(40 - i),), rows=MILLIMETRES),
+        "a first column of falling numbers",
+    ),
+    "falling numbers with gaps before whole millimetres": (
+        text(before=(lambda i: str(400 - 3 * i),), rows=MILLIMETRES),
+        "a first column of falling numbers",
+    ),
+    "some of the numbers, in disorder, before whole millimetres": (
+        text(before=(lambda i: str(7 * SHUFFLED[i]),), rows=[[str(int(x) // 40) for x in row] for row in MILLIMETRES]),
+        "a first column of different whole numbers",
+    ),
+    "labels before whole millimetres of a flat object": (
+        text(before=(lambda i: str(i % 4),), rows=[[*row[:2], str(i % 5)] for i, row in enumerate(MILLIMETRES)]),
+        "a first column of few different numbers",
+    ),
+    "labels before a plane": (
+        text(before=(lambda i: str(i % 3),), rows=[[*row[:2], "0"] for row in POINTS]),
+        "a first column of whole numbers",
+    ),
+    "times of dual returns": (text(before=(lambda i: f"{i // 2 / 30:.3f}",)), "a first column of rising numbers"),
+    "times of scan lines": (text(before=(lambda i: f"{i // 13 / 30:.3f}",)), "a first column of rising numbers"),
+    "times that fall": (text(before=(lambda i: f"{(40 - i) // 2 / 30:.3f}",)), "a first column of falling numbers"),
+    "times on a conveyor": (
+        text(before=(lambda i: f"{i / 30:.3f}",), rows=sorted(POINTS, key=lambda row: float(row[0]))),
+        "a first column of rising numbers",
+    ),
+    "times of a scanner in one plane": (
+        text(before=(lambda i: f"{i / 30:.3f}",), rows=[[*row[:2], "0"] for row in POINTS]),
+        "a first column of rising numbers",
+    ),
+    "times before whole millimetres": (
+        text(before=(lambda i: f"{i / 30:.3f}",), rows=MILLIMETRES, behind=COLOUR),
+        "a first column of rising numbers",
+    ),
+    "times before points and colours": (
+        text(before=(lambda i: f"{i / 30:.3f}",), behind=COLOUR),
+        "a first column of rising numbers",
+    ),
+    "pixels": (
+        text(before=(lambda i: str(i % 8), lambda i: str(i // 8))),
+        "a first column of whole numbers.* names of all columns into the first line of a text, such as x y z r g b",
+    ),
+    "numbers and pixels": (
+        text(before=(index, lambda i: str(i % 8), lambda i: str(i // 8))),
+        "a first column of whole numbers",
+    ),
+    "numbers and poses": (text(before=(index,), behind=("0.0", "0.6", "0.0", "0.8")), "rows that are poses"),
+    "colours first": (
+        text(before=(lambda i: str(SHUFFLED[i] % 31), lambda i: str(6 * SHUFFLED[i]), lambda i: str(255 - i))),
+        "first three columns of whole numbers from 0 to 255, .* may be colours",
+    ),
+    "normals first": (text(before=NORMALS), "first three columns of norm 1, .* may be normals; expected x y z first"),
     "a word": (text(rows=[*POINTS[:7], ["0.1", "a", "0.2"], *POINTS[8:]]), "has 'a' in line 8; expected a number"),
     "names twice": (text(",", head="x,y,z\n") + "x,y,z\n", "has 'x' in line 42; expected a number"),
     "brackets": (text(rows=[["[" + row[0], *row[1:]] for row in POINTS]), r"first line '\[0.0548"),
@@ -243,9 +339,6 @@ UNSUPPORTED = {
 }
 DAMAGED = {
     "truncated": (text()[:-12], "ends within line 40, which has 2 columns and not 3"),
-    "a count of more": (text(head="50\n"), "promises 50 points, and 40 follow"),
-    "a count of less": (text(head="30\n"), "promises 30 points, and 40 follow"),
-    "a count of less, with a title": (text(head="30\nscan\n"), "promises 30 points, and 40 follow"),
     "names alone": ("x,y,z\n", "a line of names, and no numbers"),
     "comments alone": ("# nothing\n\n", "it has no numbers"),
     "nothing": ("", "it is empty, 0 bytes"),

@@ -224,6 +224,12 @@ def materials_and_lights():
     primitive["material"] = 0
     primitive["extensions"] = {"KHR_materials_variants": {"mappings": []}}
     builder.document["nodes"][0]["extensions"] = {"KHR_lights_punctual": {"light": 0}, "MOZ_hubs_components": {}}
+    builder.document["scenes"][0]["extensions"] = {"KHR_xmp_json_ld": {"packet": 0}, "KHR_audio_emitter": {}}
+    builder.document["extensions"] = {
+        "KHR_lights_punctual": {"lights": []},
+        "KHR_materials_variants": {},
+        "VRMC_vrm": {},
+    }
     builder.document["materials"] = [{"extensions": {"KHR_materials_unlit": {}}}]
     builder.document["extensionsRequired"] = ["KHR_materials_unlit", "KHR_texture_transform"]
     builder.document["extensionsUsed"] = [*builder.document["extensionsRequired"], "KHR_draco_mesh_compression"]
@@ -377,7 +383,9 @@ def compressed(name, where="primitive", required=True):
         "accessor": builder.document["accessors"][0],
         "mesh": builder.document["meshes"][0],
         "buffer": builder.document["buffers"][0],
-        "document": {},
+        "document": builder.document,
+        "scene": builder.document["scenes"][0],
+        "node": builder.document["nodes"][0],
     }
     places[where]["extensions"] = {name: {}}
     if name == "KHR_draco_mesh_compression":
@@ -436,6 +444,12 @@ UNSUPPORTED = {
     "unknown, of an accessor": (compressed("XYZ_a", "accessor", False), "uses the extension XYZ_a in accessor 0"),
     "unknown, of a mesh": (compressed("XYZ_a", "mesh", False), "uses the extension XYZ_a in mesh 0"),
     "unknown, of a buffer": (compressed("XYZ_a", "buffer", False), "uses the extension XYZ_a in buffer 0"),
+    "unknown, of a node": (compressed("XYZ_a", "node", False), "uses the extension XYZ_a in node 0"),
+    "unknown, of a scene": (compressed("XYZ_a", "scene", False), "uses the extension XYZ_a in scene 0"),
+    "center of Cesium": (
+        compressed("CESIUM_RTC", "document", False),
+        "uses the extension CESIUM_RTC in the document; expected none that changes geometry; export it without",
+    ),
     "skin": (
         edited(lambda d, p: d["nodes"][0].update(skin=0)),
         "has a mesh that a skeleton bends .skin of node 0.; expected rigid",

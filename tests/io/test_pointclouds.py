@@ -217,6 +217,38 @@ def test_meshes_far_from_the_origin_stay_float64(tmp_path):
     assert on_a_face.any(axis=1).all()
 
 
+@pytest.mark.parametrize("suffix", ["npy", "pcd", "ply", "stl"])
+def test_float32_in_map_coordinates_is_refused(tmp_path, suffix):
+    """The file has lost the shape already: float32 has steps of half a metre there."""
+    points, path = (CLOUD.astype(np.float64) + FAR).astype(np.float32), tmp_path / f"far.{suffix}"
+    match suffix:
+        case "npy":
+            np.save(path, points)
+        case "pcd":
+            head = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 40\nHEIGHT 1\nDATA binary\n"
+            path.write_bytes(head.encode() + points.tobytes())
+        case "ply":
+            head = "".join(f"property float {axis}\n" for axis in "xyz")
+            head = f"ply\nformat binary_little_endian 1.0\nelement vertex 40\n{head}end_header\n"
+            path.write_bytes(head.encode() + points.tobytes())
+        case "stl":
+            trimesh.creation.box((1, 2, 3)).apply_translation(FAR).export(path)
+    for load in (load_points, load_mesh) if suffix == "stl" else (load_points,):
+        with pytest.raises(InputError, match=r"stores float32 numbers, which are 0.5 m apart .*doubles or relative to"):
+            load(path)
+
+
+def test_float32_is_read_where_it_resolves_a_millimetre(tmp_path):
+    path = tmp_path / "cloud.npy"
+    for offset, scale in ((8000.0, 1.0), (1e6, 0.001)):
+        np.save(path, (CLOUD / scale + np.float32(offset)).astype(np.float32))
+        np.testing.assert_allclose(load_points(path, scale=scale), CLOUD + offset * scale, atol=1e-3)
+    one_far = CLOUD.astype(np.float32)
+    one_far[0, 0] = 1e5 + 0.25  # a wrong measurement says nothing about the others
+    np.save(path, one_far)
+    np.testing.assert_array_equal(load_points(path), one_far)
+
+
 def test_clouds_become_float32_where_that_is_exact_to_a_hundredth_of_a_millimetre(tmp_path):
     for farthest, kind in ((80.0, np.float32), (900.0, np.float64)):
         np.save(tmp_path / "cloud.npy", np.linspace(-farthest, farthest, 300).reshape(100, 3))
