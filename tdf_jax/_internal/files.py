@@ -52,7 +52,7 @@ def replace_file(function: str, path: str | os.PathLike, content: bytes | Callab
             os.replace(temporary, target)
     except OSError as error:
         raise InputError(
-            f"{function}(): cannot write {path} ({error.strerror or error}); expected a writable file in an existing "
+            f"{function}: cannot write {path} ({error.strerror or error}); expected a writable file in an existing "
             "folder"
         ) from None
 
@@ -75,7 +75,7 @@ def replace_folder(function: str, path: str | os.PathLike, mark: str, names: Col
         InputError: before the block, the folder cannot be made or must not be replaced; after it, the folder cannot get
             its name, and the message says which name it has instead.
     """
-    target = Path(path).resolve()
+    target = _resolved(function, path)
     try:
         _remove_leftovers(target, names)
         _check_replaceable(function, target, mark, names)
@@ -287,3 +287,12 @@ def _check_replaceable(function: str, target: Path, mark: str, names: Collection
                 "expected a new folder: nothing of yours is overwritten"
             )
     _check_replaceable(function, target, mark, names)  # another writer has replaced it meanwhile
+
+
+def _resolved(function: str, path: str | os.PathLike) -> Path:
+    try:
+        return Path(path).resolve()
+    except (OSError, RuntimeError, ValueError) as error:  # a loop of links, or a zero byte
+        raise InputError(
+            f"{function}: cannot write {path!r} ({error}); expected a name that a folder can have"
+        ) from None

@@ -36,7 +36,7 @@ def save_trajectory(path: str | Path, trajectory: Trajectory) -> None:
             rows = np.column_stack([np.arange(len(wxyz_xyz)), wxyz_xyz[:, [4, 5, 6, 1, 2, 3, 0]]])
             np.savetxt(file, rows, fmt=f"%.{digits}g", header="t x y z qx qy qz qw")
 
-    replace_file("save_trajectory", path, write)
+    replace_file("save_trajectory()", path, write)
 
 
 @public

@@ -186,7 +186,7 @@ def save_landscape(path: str | os.PathLike, landscape: Landscape, about: dict | 
     arrays |= {"turned": landscape.turned} if landscape.turned is not None else {}
     arrays |= {"mask": grid.mask} if grid.mask is not None else {}
     text = json.dumps(header | {"about": about or {}})
-    replace_file("save_landscape", path, lambda file: np.savez(file, header=np.array(text), **arrays))
+    replace_file("save_landscape()", path, lambda file: np.savez(file, header=np.array(text), **arrays))
 
 
 @public

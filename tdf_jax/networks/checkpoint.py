@@ -72,7 +72,7 @@ def save_model(model: Model, path: str | os.PathLike) -> None:
     except _Refusal as reason:
         raise InputError(f"save_model(): {reason}") from None
     header["sha256"] = _checksum(header, tensors)
-    replace_file("save_model", target, safetensors.numpy.save(tensors, {METADATA_KEY: json.dumps(header)}))
+    replace_file("save_model()", target, safetensors.numpy.save(tensors, {METADATA_KEY: json.dumps(header)}))
 
 
 @public

@@ -57,4 +57,4 @@ class Store:
         about = [self._about, what]
         # Settings are dataclasses.
         plain = json.loads(json.dumps(about, default=dataclasses.asdict))
-        return kept("Store", self.directory, plain, compute, build)
+        return kept("tdf reproduce", self.directory, plain, compute, build)

@@ -36,7 +36,7 @@ def claim(directory: Path, settings: dict) -> None:
             f"train(): {directory} holds a run with other settings ({', '.join(changed)}); expected the same. "
             "Choose another directory, or delete this one."
         )
-    replace_file("train", directory / CONFIG, json.dumps(settings, indent=1).encode())
+    replace_file("train()", directory / CONFIG, json.dumps(settings, indent=1).encode())
 
 
 def settings_of(directory: Path) -> dict | None:
@@ -56,7 +56,7 @@ def _current(settings: dict) -> dict:
 
 def save(directory: Path, params, state, step: int) -> None:
     """Write the checkpoint."""
-    replace_file("train", directory / STATE, serialization.to_bytes({"params": params, "state": state, "step": step}))
+    replace_file("train()", directory / STATE, serialization.to_bytes({"params": params, "state": state, "step": step}))
 
 
 def restore(directory: Path, params, state) -> tuple:
@@ -107,7 +107,7 @@ def add_metrics(directory: Path, row: dict) -> None:
 def drop_later_metrics(directory: Path, step: int) -> None:
     """Remove the metrics of steps after a checkpoint, which a resumed run repeats."""
     rows = [row for row in metrics(directory) if row["step"] <= step]
-    replace_file("train", directory / METRICS, "".join(json.dumps(row) + "\n" for row in rows).encode())
+    replace_file("train()", directory / METRICS, "".join(json.dumps(row) + "\n" for row in rows).encode())
 
 
 def _row(line):

@@ -92,7 +92,7 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
     figure.update_layout(title=title, scene=scene, legend={"x": 0, "y": 1}, margin={"l": 0, "r": 0, "b": 0, "t": 40})
     page = io.StringIO()
     figure.write_html(page, include_plotlyjs=True, full_html=True, default_height="95vh")
-    replace_file("save_page", Path(path), page.getvalue().encode())
+    replace_file("save_page()", Path(path), page.getvalue().encode())
 
 
 def pages(function: str):

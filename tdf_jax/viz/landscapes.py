@@ -234,7 +234,7 @@ def save_slices(path: str | os.PathLike, landscape: Landscape, marks: Marks) -> 
             figure.savefig(frame := io.BytesIO(), format="png", dpi=GIF_DPI)
             frames.append(Image.open(frame).convert("RGB"))
     show = {"save_all": True, "append_images": frames[1:], "duration": 1000 // FRAMES_A_SECOND, "loop": 0}
-    replace_file("save_slices", path, lambda file: frames[0].save(file, format="GIF", **show))
+    replace_file("save_slices()", path, lambda file: frames[0].save(file, format="GIF", **show))
 
 
 def check_landscape(function: str, landscape: Landscape, axes: int) -> None:

@@ -37,7 +37,7 @@ def save_figure(path: str | os.PathLike, figure: Figure) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    replace_file("save_figure", Path(path), lambda file: figure.savefig(file, format="png", dpi=DPI))
+    replace_file("save_figure()", Path(path), lambda file: figure.savefig(file, format="png", dpi=DPI))
 
 
 def blank_figure(width: float, height: float, layout: Literal["constrained"] | None = None) -> Figure:

@@ -50,7 +50,7 @@ def test_a_full_disk_is_the_users_to_mend(tmp_path):
     def full(file):
         raise OSError(28, "No space left on device")
 
-    with pytest.raises(InputError, match=r"^who\(\): cannot write .*a\.bin .*No space left"):
+    with pytest.raises(InputError, match=r"^who: cannot write .*a\.bin .*No space left"):
         replace_file("who", tmp_path / "a.bin", full)
     assert tree(tmp_path) == {}
 
@@ -60,7 +60,7 @@ def test_a_file_that_has_no_place(tmp_path, place):
     (tmp_path / "file").write_bytes(b"")
     (tmp_path / "folder").mkdir()
     before = tree(tmp_path)
-    with pytest.raises(InputError, match=r"^who\(\): cannot write .*expected a writable file in an existing folder"):
+    with pytest.raises(InputError, match=r"^who: cannot write .*expected a writable file in an existing folder"):
         replace_file("who", tmp_path / place, b"new")
     assert tree(tmp_path) == before
 
