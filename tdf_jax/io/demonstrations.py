@@ -58,7 +58,7 @@ def save_demonstration(path: str | os.PathLike, demonstration: Demonstration) ->
         values = (target.points, target.query, target.T_world_contact)
         arrays |= {name: np.asarray(value) for name, value in zip(TARGET_ARRAYS, values, strict=True)}
         arrays["schema"] = np.int64(TARGET_SCHEMA)
-    replace_file("save_demonstration", path, lambda file: np.savez(file, **arrays))
+    replace_file("save_demonstration()", path, lambda file: np.savez(file, **arrays))
 
 
 @public
