@@ -38,7 +38,7 @@ class Target:
 
     @public
     def __post_init__(self):
-        # Stored as the checks return them, so that lists and arrays of other libraries do not travel on.
+        # Stored as the checks return them, so that lists and arrays of other libraries are converted once.
         object.__setattr__(self, "points", checks.points("Target()", self.points))
         object.__setattr__(self, "query", checks.query("Target()", self.query))
         object.__setattr__(self, "T_world_contact", checks.pose("Target()", "T_world_contact", self.T_world_contact))

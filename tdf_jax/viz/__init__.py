@@ -1,5 +1,7 @@
 """Pictures; matplotlib loads only with these modules.
 
+Importing this package imports matplotlib and, for that moment, hides MPLBACKEND.
+
 Modules:
     contact_sheet: many objects side by side
     evaluation: pictures of the benchmark

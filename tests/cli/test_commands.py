@@ -21,7 +21,7 @@ from tdf_jax.evaluation.metrics import pose_error
 from tdf_jax.geometry.paths import PATHS
 from tdf_jax.io.demonstrations import save_demonstration
 from tdf_jax.networks.checkpoint import load_model, save_model
-from tdf_jax.shapes import FAMILIES, build_mug
+from tdf_jax.shapes import build_mug
 
 QUICK = ("--method", "adam", "--num-starts", STARTS, "--iterations", 3, "--points", 60)
 TINY = (*QUICK, "--num-poses", POSES, "--queries", QUERIES)
@@ -679,10 +679,6 @@ def test_pictures_of_an_evaluation(weights, real, tmp_path, monkeypatch):
     assert (tmp_path / "pictures" / "transfers.png").read_bytes().startswith(b"\x89PNG")
     assert len(drawn) == 2  # one generated mug, and the real one in one of its poses
     np.testing.assert_allclose(drawn[1], build_mug().mesh.bounds, atol=1e-4)
-
-
-def test_every_category_can_be_asked_for():
-    assert typing.get_args(scene.Category) == tuple(FAMILIES)
 
 
 def test_every_condition_can_be_asked_for():

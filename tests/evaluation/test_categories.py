@@ -176,12 +176,12 @@ def test_commands_name_the_families():
     hint = typing.get_type_hints(Settings)["category"]
     (choices,) = (typing.get_args(one) for one in typing.get_args(hint) if one is not type(None))
     assert choices == tuple(FAMILIES)
-    from tdf_jax.cli.evaluate import Category
-
-    assert typing.get_args(Category) == tuple(FAMILIES)
+    assert typing.get_args(options.Category) == tuple(FAMILIES)
+    from tdf_jax.cli.evaluate import evaluate
     from tdf_jax.cli.shapes import shapes
 
-    assert typing.get_args(typing.get_type_hints(shapes)["category"]) == tuple(FAMILIES)
+    assert typing.get_type_hints(evaluate)["category"] == tuple[options.Category, ...]
+    assert typing.get_type_hints(shapes)["category"] == options.Category
 
 
 @pytest.mark.parametrize(
