@@ -25,6 +25,7 @@ SEEDS = 2**32  # jax truncates a larger seed to 32 bits without a warning
 FARTHEST = 250.0
 SMALLEST_IN_MILLIMETRES = 10.0  # extent of a cloud above which its numbers are probably millimetres
 UNIT_NORM = 1e-3  # largest deviation of a quaternion's norm from 1: rounding to three decimals, or to float16
+SENTINELS = 8  # values that may stand for missing measurements in one cloud
 SENTINEL_SHARE = 0.01  # share of the rows that may have one value, where other values are not as common
 MOST = 2**32 - 1  # largest count: array sizes and loop lengths beyond have no memory, and XLA fails without a message
 MINIMUM_POINTS = 21  # the encoder's 20 nearest neighbours, the point itself included, and one to choose from
@@ -46,9 +47,13 @@ def count(function: str, name: str, value, least: int = 1, most: float = np.inf)
 
 def counts(function: str, name: str, value, size: int = 3) -> tuple[int, ...]:
     """Check that a value is `size` whole numbers of at least 1; return them."""
-    if np.shape(value) != (size,) or not all(_is_whole(n) and n >= 1 for n in value):
+    try:
+        numbers = tuple(value)
+    except TypeError:  # one number, or something else
+        numbers = ()
+    if len(numbers) != size or not all(_is_whole(n) and 1 <= n <= MOST for n in numbers):
         raise InputError(f"{function}: {name} is {value}; expected {_in_words(size)} whole numbers of at least 1")
-    return tuple(int(n) for n in value)
+    return tuple(int(n) for n in numbers)
 
 
 def seed(function: str, value, name: str = "seed") -> int:
@@ -129,6 +134,8 @@ def vector(function: str, name: str, value: ArrayLike, size: int = 3, unit: str 
         raise InputError(
             f"{function}: {name} is {value}; expected {_in_words(size)} finite numbers{unit and ', ' + unit}"
         )
+    if size == 3 and unit == "metres" and not traced(vector):
+        near(function, name, np.asarray(vector)[None])
     return vector
 
 
@@ -225,8 +232,8 @@ def near(function: str, name: str, coordinates: np.ndarray, given=None) -> None:
         unit = " If they are in millimetres, multiply them by 0.001" if wide else ""
         raise InputError(
             f"{function}: {name} has coordinates of up to {farthest:.6g} m; expected at most {FARTHEST:g} m from the "
-            "origin, because float32 does not resolve 0.1 mm there. Subtract one offset from all clouds and poses in "
-            f"float64, such as offset = points.mean(axis=0), and add it to the resulting positions.{unit}"
+            f"origin, because float32 does not resolve 0.1 mm there.{unit} Subtract one offset from all clouds and "
+            "poses in float64, such as offset = points.mean(axis=0), and add it to the resulting positions"
         )
 
 
@@ -319,11 +326,13 @@ def points(function: str, value: Any, name: str = "points") -> Any:
 
 
 def repeated_rows(values: np.ndarray) -> list[tuple[np.ndarray, int]]:
-    """Find the rows of a cloud that stand for missing measurements: one value, repeated far more often than others.
+    """Find the rows of a cloud that stand for missing measurements: a value that is repeated far more than others.
 
-    The origin stands for a missing measurement if it occurs twice, any other value if more than 1 % of the rows have
-    it. In merged and quantised clouds, and among the corners of triangles, many values occur several times. So a
-    value counts as repeated only if it is also at least twice as common as the fourth most common one.
+    A value stands for a missing measurement if more than 1 % of the rows have it, the origin if two rows have it. In
+    merged and quantised clouds, and among the corners of triangles, many values occur several times, and so may the
+    origin. So a value counts only if it is also about twice as common as the ordinary ones, or if it is the origin and
+    far from all other points. The eight most common values, or 2 % of all, may stand for missing measurements: a rig of
+    several cameras moves the origin of each to another place.
 
     Args:
         values: finite points, (points, 3).
@@ -333,10 +342,17 @@ def repeated_rows(values: np.ndarray) -> list[tuple[np.ndarray, int]]:
     """
     values = np.ascontiguousarray(values) + 0  # 0 and -0 are one number
     _, first, counts = np.unique(_row_hashes(values), return_index=True, return_counts=True)
-    usual = 2 * np.sort(counts)[-min(4, len(counts))] - 1
-    least = np.where(values[first].any(axis=1), max(SENTINEL_SHARE * len(values), 2, usual), usual)
+    most = min(max(SENTINELS, len(counts) // 50), len(counts) - 1)
+    usual = 2 * np.sort(counts)[::-1][most] - 1
+    distinct = values[first]
+    origin = ~distinct.any(axis=1)
+    least = np.where(origin, usual, max(SENTINEL_SHARE * len(values), 2, usual))
+    if origin.any() and len(distinct) > 1:
+        spacing = np.linalg.norm(np.ptp(distinct[~origin], axis=0)) / np.sqrt(len(distinct))
+        if np.linalg.norm(distinct[~origin].astype(np.float64), axis=1).min() > 3 * spacing:
+            least[origin] = 1
     chosen = np.flatnonzero(counts > least)
-    return [(values[first[i]], int(counts[i])) for i in chosen[np.argsort(-counts[chosen], kind="stable")]]
+    return [(distinct[i], int(counts[i])) for i in chosen[np.argsort(-counts[chosen], kind="stable")]]
 
 
 def _row_hashes(values: np.ndarray) -> np.ndarray:

@@ -70,14 +70,15 @@ def demonstrate(
     size = query_box[0] if len(query_box) == 1 else query_box
     query = box_query(jax.random.key(seed), queries, size, query_centre)
     cloud = load_points(points, count, scale, seed, drop_invalid=drop_invalid)
-    demonstration = Demonstration(cloud, load_trajectory(trajectory), query, grasp, release)
+    recorded = load_trajectory(trajectory)
+    check_frames(command, cloud, recorded, query, grasp)
+    demonstration = Demonstration(cloud, recorded, query, grasp, release)
     if target_object is not None:
         # With another seed, because samples of one mesh by one seed are the same points.
         placed = load_points(target_object, count, scale, (seed + 1) % checks.SEEDS, drop_invalid=drop_invalid)
         moved = se3.transform(demonstration.object_motion, jnp.asarray(cloud))
         region = contact_query(moved, placed, jax.random.fold_in(jax.random.key(seed), 1), contacts)
         demonstration = dataclasses.replace(demonstration, target=Target(placed, region))
-    check_frames(command, demonstration)
     if num_poses is not None:
         demonstration = demonstration.resampled(num_poses)
     save_demonstration(out, demonstration)

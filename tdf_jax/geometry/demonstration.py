@@ -13,6 +13,9 @@ from tdf_jax.geometry import se3
 from tdf_jax.geometry.target import Target, require_contact
 from tdf_jax.geometry.trajectory import Trajectory, check_trajectory, resample
 
+# Diagonals of the cloud. Query points far from the object are legitimate, but their descriptors fade with the distance
+# (figure 3 of the paper); a wrong unit is a factor of 39 or more.
+LARGEST_QUERY, FARTHEST_QUERY = 10.0, 10.0
 SAME_POINT = 1e-5  # metres within which a point of the object is one of the target, and not only close to it
 
 
@@ -67,6 +70,7 @@ class Demonstration:
             if not checks.traced(array):
                 coordinates = np.asarray(array)
                 checks.near("Demonstration()", name, coordinates[:, -3:], coordinates)
+        self._check_query()
         if self.target is not None:
             self._check_target(self.target)
 
@@ -125,6 +129,28 @@ class Demonstration:
         poses = jnp.concatenate([jnp.asarray(part.wxyz_xyz) for part in parts])
         last = self._first + num_poses - 1
         return dataclasses.replace(self, trajectory=Trajectory(poses), grasp=self._first, release=last)
+
+    def _check_query(self) -> None:
+        """Refuse query points of another unit or frame: far from the object, all descriptors are alike."""
+        if checks.traced(self.points, self.trajectory, self.query):
+            return
+        cloud, query = (np.asarray(array, np.float64) for array in (self.points, self.query))
+        diagonal, size = (float(np.linalg.norm(np.ptp(array, axis=0))) for array in (cloud, query))
+        if size > LARGEST_QUERY * diagonal:
+            raise InputError(
+                f"Demonstration(): the query points have a diagonal of {size:.3g} m, and the cloud one of "
+                f"{diagonal:.3g} m; expected a part of the object. If they are in millimetres, multiply by 0.001"
+            )
+        grasp = jnp.asarray(self.trajectory.wxyz_xyz)[self._first]
+        carried = np.asarray(se3.transform(grasp, jnp.asarray(query)), np.float64)
+        low, high = cloud.min(axis=0), cloud.max(axis=0)
+        gap = np.linalg.norm(np.maximum(0, np.maximum(low - carried, carried - high)), axis=1).min()
+        if gap > FARTHEST_QUERY * diagonal:
+            raise InputError(
+                f"Demonstration(): at the grasp, pose {self._first}, the query points are {gap:.3g} m from the object, "
+                f"whose diagonal is {diagonal:.3g} m; expected them at the object. Check that cloud, poses and query "
+                "points are in metres, that the poses are T_world_query in the frame of the cloud, and grasp"
+            )
 
     def _check_target(self, target: Target) -> None:
         if not isinstance(target, Target):

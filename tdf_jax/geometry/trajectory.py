@@ -84,6 +84,7 @@ class Trajectory:
         if T.ndim != 3 or T.shape[1:] != (4, 4):
             raise InputError(f"Trajectory.from_matrices(): matrices have shape {T.shape}; expected (poses, 4, 4)")
         if not checks.traced(T):
+            checks.near("Trajectory.from_matrices()", "T_world_query", np.asarray(T[:, :3, 3]))
             if not np.isfinite(T).all():
                 raise InputError("Trajectory.from_matrices(): a matrix is NaN or infinite; expected rigid transforms")
             checks.rotations("Trajectory.from_matrices()", "T_world_query", T[:, :3, :3])
@@ -103,8 +104,12 @@ class Trajectory:
 
         Returns:
             The trajectory in the new frame.
+
+        Raises:
+            InputError: T_new_world is not one finite pose.
         """
-        return Trajectory(se3.compose(jnp.asarray(T_new_world), self.wxyz_xyz))
+        T = jnp.asarray(checks.pose("Trajectory.transformed()", "T_new_world", T_new_world))
+        return Trajectory(se3.compose(T, self.wxyz_xyz))
 
     @public
     def shifted(self, offset: ArrayLike) -> "Trajectory":
@@ -115,8 +120,12 @@ class Trajectory:
 
         Returns:
             The shifted trajectory.
+
+        Raises:
+            InputError: the offset is not three finite numbers, or farther than float32 resolves.
         """
-        return Trajectory(jnp.concatenate([self.wxyz_xyz[..., :4], self.translations + jnp.asarray(offset)], axis=-1))
+        vector = jnp.asarray(checks.vector("Trajectory.shifted()", "offset", offset), self.wxyz_xyz.dtype)
+        return Trajectory(jnp.concatenate([self.wxyz_xyz[..., :4], self.translations + vector], axis=-1))
 
     def displaced(self, offset: ArrayLike, where: Literal["start", "goal"] = "goal") -> "Trajectory":
         """Displace one end of the trajectory, as `displace` does.
@@ -169,6 +178,7 @@ def check_trajectory(trajectory: Trajectory, name: str = "trajectory") -> Trajec
                 f"check_trajectory(): pose {np.argmin(finite)} of {name} is NaN or infinite; expected finite poses"
             )
         checks.unit_quaternions("check_trajectory()", name, values)
+        checks.near("check_trajectory()", name, values[:, 4:])
     return trajectory
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import public
@@ -13,7 +14,7 @@ from tdf_jax._internal.files import replace_file
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.target import Target
-from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.geometry.trajectory import Trajectory, check_trajectory
 
 ARRAYS = ("points", "wxyz_xyz", "query")
 INDICES = {"grasp": 0, "release": -1}  # with the values that files without them have
@@ -24,8 +25,9 @@ SCHEMA, TARGET_SCHEMA = 2, 3
 # Diagonals of a cloud between which its unit may be metres: a grain of rice and a van.
 SMALLEST, LARGEST = 0.003, 10.0
 UNITS = {"millimetres": 0.001, "centimetres": 0.01}
-# Largest distance of the query points from the object at the grasp, diagonals of both. Remote query points are
-# legitimate, but descriptors fade with the distance (figure 3 of the paper).
+LARGEST_QUERY = 3.0  # largest diagonal of the query points, diagonals of the cloud
+# Largest distance of the query points' centroid from the object at the grasp, diagonals of the cloud. Remote query
+# points are legitimate, but descriptors fade with the distance (figure 3 of the paper).
 FARTHEST_GRASP = 2.0
 
 
@@ -114,9 +116,9 @@ def load_demonstration(path: str | os.PathLike) -> Demonstration:
     try:
         # Checked in float64, because far coordinates and bad norms would be rounded away.
         target = Target(*(arrays[name].astype(np.float64) for name in TARGET_ARRAYS)) if given else None
-        path_in_double = Trajectory(wxyz_xyz)  # pyright: ignore[reportArgumentType]
-        demonstration = Demonstration(points, path_in_double, query, grasp, release, target)
-        check_frames("load_demonstration()", demonstration)
+        trajectory = Trajectory(wxyz_xyz)  # pyright: ignore[reportArgumentType]
+        check_frames("load_demonstration()", points, trajectory, query, grasp)
+        Demonstration(points, trajectory, query, grasp, release, target)
     except InputError as error:
         raise InputError(f"load_demonstration(): {path}: {error}") from None
     if target is not None:
@@ -125,19 +127,31 @@ def load_demonstration(path: str | os.PathLike) -> Demonstration:
     return Demonstration(points.astype(np.float32), trajectory, query.astype(np.float32), grasp, release, target)
 
 
-def check_frames(function: str, demonstration: Demonstration) -> None:
+def check_frames(
+    function: str,
+    points: Float[np.ndarray, "points 3"],
+    trajectory: Trajectory,
+    query: Float[Array | np.ndarray, "queries 3"],
+    grasp: int,
+) -> None:
     """Check that a demonstration's unit can be metres, and that its query points are at the object at the grasp.
 
     Args:
         function: name that the messages begin with.
-        demonstration: demonstration to check.
+        points: object point cloud before the grasp, (points, 3), world frame.
+        trajectory: poses of the query frame, T_world_query.
+        query: query points, (queries, 3), query frame.
+        grasp: index of the pose at which the object is grasped.
 
     Raises:
-        InputError: the cloud is smaller or larger than any object, or the query points are far from it; the message
-            names the unit or the frame that would explain it.
+        InputError: the arrays are not a demonstration's, the cloud is smaller or larger than any object, or the query
+            points are far larger than it or far from it; the message names the unit or the frame that would explain it.
     """
-    points, query = np.asarray(demonstration.points, float), np.asarray(demonstration.query, float)
-    grasp = np.asarray(demonstration.trajectory.wxyz_xyz, float)[demonstration.grasp]
+    points = np.asarray(checks.points(function, points), np.float64)
+    query = np.asarray(checks.query(function, query), np.float64)
+    num_poses = check_trajectory(trajectory).num_poses
+    index = checks.count(function, "grasp", grasp, -num_poses, num_poses - 1)
+    pose = np.asarray(trajectory.wxyz_xyz, np.float64)[index]
     diagonal = _diagonal(points)
     if not SMALLEST <= diagonal <= LARGEST:
         unit = next((unit for unit, metres in UNITS.items() if 0.05 <= diagonal * metres <= 1), None)
@@ -145,19 +159,24 @@ def check_frames(function: str, demonstration: Demonstration) -> None:
         raise InputError(
             f"{function}: the cloud has a diagonal of {diagonal:.3g} m; expected an object in metres. {hint}"
         )
-    reach = FARTHEST_GRASP * (diagonal + _diagonal(query))
-    gap = _gap(points, grasp, query)
+    if _diagonal(query) > LARGEST_QUERY * diagonal:
+        raise InputError(
+            f"{function}: the query points have a diagonal of {_diagonal(query):.3g} m, and the cloud one of "
+            f"{diagonal:.3g} m; expected a part of the object, in metres"
+        )
+    reach = FARTHEST_GRASP * diagonal
+    gap = _gap(points, pose, query)
     if gap <= reach:
         return
-    inverse = np.asarray(se3.inverse(jnp.asarray(grasp)), float)
+    inverse = np.asarray(se3.inverse(jnp.asarray(pose)), float)
     explanations = {"the poses are probably T_query_world: invert them": (points, inverse)}
     for unit, metres in UNITS.items():
-        smaller = np.concatenate([grasp[:4], metres * grasp[4:]])
-        explanations[f"the cloud is probably in {unit}: multiply it by {metres:g}"] = (metres * points, grasp)
+        smaller = np.concatenate([pose[:4], metres * pose[4:]])
+        explanations[f"the cloud is probably in {unit}: multiply it by {metres:g}"] = (metres * points, pose)
         explanations[f"the positions are probably in {unit}: multiply them by {metres:g}"] = (points, smaller)
     hint = "check that cloud and poses are in one frame and in metres, and that grasp is the index of the grasp"
     gaps = {
-        text: _gap(cloud, pose, query) / (_diagonal(cloud) + _diagonal(query))
+        text: _gap(cloud, pose, query) / _diagonal(cloud)
         for text, (cloud, pose) in explanations.items()
         if _diagonal(cloud) >= 0.02
     }
@@ -165,7 +184,7 @@ def check_frames(function: str, demonstration: Demonstration) -> None:
     if gaps[likely] <= FARTHEST_GRASP / 2:
         hint = likely
     raise InputError(
-        f"{function}: at the grasp, pose {demonstration.grasp}, the query points are {gap:.3g} m from the object, "
+        f"{function}: at the grasp, pose {grasp}, the query points are {gap:.3g} m from the object, "
         f"whose diagonal is {diagonal:.3g} m; expected them at the object; {hint}"
     )
 

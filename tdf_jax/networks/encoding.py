@@ -116,7 +116,11 @@ def _warn_of_size(info: ModelInfo, cloud: np.ndarray) -> None:
     least, most = info.smallest_diagonal / SIZE_TOLERANCE, info.largest_diagonal * SIZE_TOLERANCE
     if least <= diagonal <= most:
         return
-    likely = next((unit for unit, metres in UNITS.items() if least <= diagonal * metres <= most), None)
+    # Centimetres and inches differ by less than the range of sizes: the unit that fits it best is the likely one.
+    middle = np.sqrt(info.smallest_diagonal * info.largest_diagonal)
+    likely = min(UNITS, key=lambda unit: abs(np.log(max(diagonal, 1e-30) * UNITS[unit] / middle)))
+    if not least <= diagonal * UNITS[likely] <= most:
+        likely = None
     advice = "check its unit, and whether it holds the object alone"
     if likely is not None:
         advice = f"it is probably in {likely}: multiply it by {UNITS[likely]:g}, or give --scale {UNITS[likely]:g}"

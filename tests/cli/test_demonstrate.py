@@ -127,6 +127,7 @@ def test_options_of_a_target_need_one(capsys, words, message):
         ({"grasp": 7}, "expected the grasp first"),
         ({"scale": 0.0001}, "diagonal of"),
         ({"query-centre": "9 0 0"}, "expected them at the object"),
+        ({"query-box": 60}, "query points have a diagonal of"),
         ({"seed": -1}, "--seed is -1"),
         ({"out": "demo.json"}, "expected .npz"),
         ({"trajectory": "nowhere.tum"}, "there is no file nowhere.tum"),

@@ -233,7 +233,7 @@ def judge_command(case: CommandCase, folder: Path) -> tuple[str, str]:
         problem = "a message without end"
     elif code == 2 and changed and case.command not in RESUMED:
         problem = f"refused, and writes {changed}"
-    elif any(re.search(r"[0-9a-f]{16}\.(new|old)$", name) for name in changed):
+    elif any(re.search(r"\.(unfinished|replaced)$", name) for name in changed):
         problem = f"leaves {changed}"
     elif code == 0:
         verdict = WARNED if "warning:" in output else RIGHT

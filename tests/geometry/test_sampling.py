@@ -15,6 +15,26 @@ def with_rows(value, count):
     return np.insert(CLOUD, np.linspace(0, len(CLOUD), count).astype(int), value, axis=0)
 
 
+CAMERAS = np.array([[0.3, 0.2, 0.3], [0.3, 0.1, 0.3], [0.3, -0.1, 0.3], [0.3, -0.2, 0.3], [0, 0, 0], [1, 1, 1]])
+
+
+@pytest.mark.parametrize("share", [0.016, 0.1, 0.5])
+def test_the_sentinels_of_several_cameras_are_refused_and_removed(share):
+    """Each camera writes its own origin, which is another point of the world."""
+    cloud = np.concatenate([CLOUD, np.repeat(CAMERAS, int(np.ceil(share * len(CLOUD))), axis=0)])
+    with pytest.raises(InputError) as refusal:
+        checks.points("f()", cloud)
+    assert all(str(camera.tolist()) in str(refusal.value) for camera in CAMERAS)
+    with pytest.warns(tdf.InvalidPointsWarning, match=f"removed {len(cloud) - len(CLOUD)} of {len(cloud)} points"):
+        np.testing.assert_array_equal(tdf.drop_invalid(cloud), CLOUD)
+
+
+def test_the_origin_far_from_the_cloud_is_a_sentinel_whatever_else_is_repeated():
+    cloud = np.concatenate([np.repeat(CLOUD[:40], 4, axis=0), CLOUD[40:], np.zeros((2, 3))])
+    with pytest.raises(InputError, match=r"2 are \[0.0, 0.0, 0.0\]"):
+        checks.points("f()", cloud)
+
+
 @pytest.mark.parametrize(
     ("value", "count"), [((0, 0, 0), 2), ((0, 0, -0.0), 300), ((0, 0, 10), 13), ((-1, -1, -1), 200), ((9, 9, 9), 600)]
 )

@@ -106,7 +106,7 @@ POINTS = 0.1 * np.random.default_rng(2).normal(size=(60, 3)) + [0.1, 0.05, 0.1]
 T_GRASP = np.array([0.6, 0.0, 0.8, 0.0, 0.12, 0.07, 0.15])
 FRAMES = {
     "right": (POINTS, T_GRASP, False),
-    "If they are in millimetres, multiply them by 0.001": (1000 * POINTS, T_GRASP, True),
+    "diagonal of 795 m; .*It is probably in millimetres": (1000 * POINTS, T_GRASP, True),
     "It is probably in millimetres: multiply it by 0.001": (300 * (POINTS - POINTS.mean(axis=0)), T_GRASP, True),
     "the positions are probably in millimetres": (POINTS, T_GRASP * [1, 1, 1, 1, 1e3, 1e3, 1e3], True),
     "the positions are probably in centimetres": (POINTS, T_GRASP * [1, 1, 1, 1, 100, 100, 100], True),

@@ -78,7 +78,12 @@ def test_double_precision_has_no_limit(small_model):
 
 @pytest.mark.parametrize(
     ("factor", "advice"),
-    [(1000, "millimetres: multiply it by 0.001"), (100, "centimetres: multiply it by 0.01"), (0.01, "check its unit")],
+    [
+        (1000, "millimetres: multiply it by 0.001"),
+        (100, "centimetres: multiply it by 0.01"),
+        (39.37, "inches: multiply it by 0.0254"),
+        (0.01, "check its unit"),
+    ],
 )
 def test_a_wrong_unit_is_warned_of_with_the_likely_one(sized_model, factor, advice):
     with pytest.warns(tdf.SizeWarning, match=rf"encode\(\): .*trained on objects of 0.2 to 0.5 m.*{advice}"):
