@@ -229,19 +229,6 @@ FAST += ("load_trajectory", "path_grid", "plane_grid", "confidence", "thin", "tu
 FAST_SETTINGS = ("rank promotion", "dtype promotion", "transfer guard")
 
 
-# Cells that wait for a change of a validator: a pending one that passes is an error.
-PENDING = {
-    ("traced", "cluster_poses"): "checks.numbers() takes the error of a traced value for one of the type",
-    ("masked", "describe"): "checks.query() returns the masked array",
-}
-
-
-def pending(kind, name):
-    """Marks of a cell."""
-    reason = PENDING.get((kind, name))
-    return [pytest.mark.xfail(strict=True, reason=reason)] if reason else []
-
-
 def numbers(value) -> list[np.ndarray]:
     """All numbers of a result, in order."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type) and not jax.tree.leaves(value) == [value]:
@@ -434,7 +421,7 @@ def test_pure_functions_in_transformations_under_all_settings(world, name):
 
 
 @pytest.mark.parametrize("transform", [jax.jit, jax.vmap, jax.grad], ids=lambda transform: transform.__name__)
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pending("traced", name)) for name in REFUSED])
+@pytest.mark.parametrize("name", REFUSED)
 def test_what_needs_known_numbers_is_refused_by_name(world, name, transform):
     function, argument = REFUSED[name]
     x, _ = getattr(world, argument), (world.box, world.near, world.landscape)  # made before anything is traced
@@ -504,11 +491,7 @@ KINDS = {
 
 @pytest.mark.parametrize(
     ("name", "kind"),
-    [
-        pytest.param(name, kind, marks=pending(kind, name) + ([] if name in FAST else [pytest.mark.slow]))
-        for name in FOREIGN
-        for kind in KINDS
-    ],
+    [pytest.param(name, kind, marks=[] if name in FAST else [pytest.mark.slow]) for name in FOREIGN for kind in KINDS],
 )
 def test_arrays_of_other_libraries_give_the_same_result(world, name, kind):
     expected = numbers(FOREIGN[name](world, np.asarray))

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tdf_jax._internal.boundary import plain_array
+from tdf_jax._internal.boundary import is_foreign, plain_array
 from tdf_jax._internal.errors import InputError
 
 SEEDS = 2**32  # jax truncates a larger seed to 32 bits without a warning
@@ -392,7 +392,9 @@ def query(function: str, value) -> ArrayLike:
 
 def _native(numbers: np.ndarray, given) -> np.ndarray:
     """The array that was given if JAX takes it as it is, otherwise its numbers in float64."""
-    takes = isinstance(given, np.ndarray) and given.dtype.isnative and given.dtype.kind in "fV"
+    takes = (
+        isinstance(given, np.ndarray) and given.dtype.isnative and given.dtype.kind in "fV" and not is_foreign(given)
+    )
     return given if takes else numbers
 
 
@@ -426,5 +428,7 @@ def numbers(function: str, name: str, value) -> np.ndarray:
         if array.dtype.kind in "cmMSU":  # complex numbers and dates would become other numbers, and so would text
             raise TypeError
         return np.asarray(array, dtype=np.float64)
+    except jax.errors.TracerArrayConversionError:  # the boundary says which argument is traced
+        raise
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"{function}: {name} is {value!r}; expected real numbers") from None
