@@ -15,7 +15,7 @@ from tdf_jax._internal.deprecation import caller_level, renamed_keywords
 from tdf_jax._internal.errors import CategoryWarning, ConfidenceWarning, InputError
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference, describe
-from tdf_jax.geometry.demonstration import Demonstration, require_apart
+from tdf_jax.geometry.demonstration import Demonstration, check_apart
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.model import Model
 from tdf_jax.relation import carry_object, reference_of, target_field
@@ -109,7 +109,7 @@ def imitate(
     if reference.contact is not None:
         target = target_field(model, target_points, target_model)
         if target_points is not None:
-            require_apart("imitate()", points, target_points)
+            check_apart("imitate()", points, target_points)
         search = {"config": config, "progress": progress, "device_mesh": device_mesh}
         return _judged(carry_object(field, target, reference, key, **search), model.info.name, field, points)
     goal = None if goal is None else jnp.asarray(checks.pose("imitate()", "goal", goal), float)

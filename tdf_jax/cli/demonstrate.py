@@ -43,8 +43,7 @@ def demonstrate(
     """Make a demonstration file for `tdf imitate --demonstration` from a recorded motion and a cloud.
 
     Args:
-        points: point cloud or mesh of the demonstrated object as it lies before the grasp, in the frame of the
-            trajectory.
+        points: point cloud or mesh of the demonstrated object before the grasp, in the frame of the trajectory.
         trajectory: recorded poses of the query frame, such as the gripper's, in the order of the motion: .tum, .csv
             with the columns x y z qx qy qz qw, or .npz; metres.
         query_box: edge lengths of the box of query points in the query frame, metres: the part of the object that the

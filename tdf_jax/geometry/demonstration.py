@@ -10,7 +10,7 @@ from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import public
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
-from tdf_jax.geometry.target import Target, require_contact
+from tdf_jax.geometry.target import Target, check_contact
 from tdf_jax.geometry.trajectory import Trajectory, check_trajectory, resample
 
 # Diagonals of the cloud. Query points far from the object are legitimate, but their descriptors fade with the distance
@@ -49,7 +49,7 @@ class Demonstration:
 
     @public
     def __post_init__(self):
-        # Stored as the checks return them, so that lists and arrays of other libraries do not travel on.
+        # Stored as the checks return them, so that lists and arrays of other libraries are converted once.
         object.__setattr__(self, "points", checks.points("Demonstration()", self.points))
         if not isinstance(self.trajectory, Trajectory):
             raise InputError(
@@ -77,14 +77,14 @@ class Demonstration:
     @property
     @public
     def object_motion(self) -> Float[Array, "7"]:
-        """Motion of the object from the grasp to the release, `wxyz_xyz`: its point x as it lies ends at D x."""
+        """Motion of the object from the grasp to the release, `wxyz_xyz`: its initial point x ends at D x."""
         poses = jnp.asarray(self.transfer.wxyz_xyz)
         return se3.compose(poses[-1], se3.inverse(poses[0]))
 
     @property
     @public
     def T_object_contact(self) -> Float[Array, "7"]:
-        """Pose of the contact frame on the object as it lies before the grasp, world frame, `wxyz_xyz`.
+        """Pose of the contact frame on the object in its initial pose, before the grasp, world frame, `wxyz_xyz`.
 
         Raises:
             InputError: there is no target.
@@ -163,8 +163,8 @@ class Demonstration:
             return
         cloud = np.asarray(self.points, np.float64)
         contact = np.asarray(self.T_object_contact)
-        require_contact("Demonstration()", "object, moved to the release", cloud, np.asarray(target.query), contact)
-        require_apart("Demonstration()", cloud, target.points)
+        check_contact("Demonstration()", "object, moved to the release", cloud, np.asarray(target.query), contact)
+        check_apart("Demonstration()", cloud, target.points)
 
     @property
     def _first(self) -> int:
@@ -178,7 +178,7 @@ class Demonstration:
         return Trajectory(self.trajectory.wxyz_xyz[begin:end])
 
 
-def require_apart(function: str, points, target_points) -> None:
+def check_apart(function: str, points, target_points) -> None:
     """Check that the clouds of object and target do not show the same points.
 
     Args:

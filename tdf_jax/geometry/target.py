@@ -46,12 +46,10 @@ class Target:
             return
         cloud = np.asarray(self.points, np.float64)
         checks.near("Target()", "points", cloud, self.points)
-        require_contact("Target()", "target", cloud, np.asarray(self.query), np.asarray(self.T_world_contact))
+        check_contact("Target()", "target", cloud, np.asarray(self.query), np.asarray(self.T_world_contact))
 
 
-def require_contact(
-    function: str, what: str, cloud: np.ndarray, query: np.ndarray, T_world_contact: np.ndarray
-) -> None:
+def check_contact(function: str, what: str, cloud: np.ndarray, query: np.ndarray, T_world_contact: np.ndarray) -> None:
     """Check that contact points lie at a cloud.
 
     Args:
