@@ -69,6 +69,9 @@ def existing_file(function: str, path: str | Path, suffixes: tuple[str, ...], sc
     return path
 
 
+LONGEST_REASON = 300  # characters: some parsers quote all that they could not read
+
+
 @contextmanager
 def reading(function: str, path: Path) -> Iterator[None]:
     """Turn what a reader raises into an `InputError` that names the file.
@@ -93,7 +96,7 @@ def reading(function: str, path: Path) -> Iterator[None]:
         reason = error.strerror or str(error)
         raise InputError(f"{function}: {path} cannot be opened ({reason}); expected a file you may read") from error
     except Exception as error:  # what parsers of damaged files raise goes from KeyError to RecursionError
-        reason = str(error) or type(error).__name__
+        reason = (str(error) or type(error).__name__)[:LONGEST_REASON]
         suffix = path.suffix.lower()
         raise InputError(f"{function}: {path} cannot be read as {suffix} ({reason}); save it again") from error
 

@@ -34,6 +34,7 @@ FORMER_SIZES = {"tdf train": (0.08, 0.5), "converted from": NDF_SIZES}
 # All metadata are under one key because safetensors writes several keys in random order, and equal models should give
 # equal files.
 METADATA_KEY = "tdf_jax"
+MOST_INTEGER = 2**53  # integers beyond are no numbers of float64
 HEADER_KEYS = {"schema", "config", "info", "sha256"}
 
 
@@ -202,12 +203,19 @@ def _record(kind: type, values: Mapping):
         raise _Refusal(f"its {kind.__name__} does not have the expected fields ({error})") from None
     except InputError as error:
         raise _Refusal(f"its {error}") from None
+    floats = {}
     for field in dataclasses.fields(kind):
         value = getattr(record, field.name)
         kinds = {float: int | float, float | None: int | float | None}.get(field.type, cast(type, field.type))
         if isinstance(value, bool) or not isinstance(value, kinds):
             raise _Refusal(f"its {kind.__name__}.{field.name} is a {type(value).__name__}; expected {field.type}")
-    return record
+        if isinstance(value, int) and field.type in (float, float | None):
+            if abs(value) > MOST_INTEGER:
+                raise _Refusal(
+                    f"its {kind.__name__}.{field.name} has {len(str(value))} digits; expected a number that float64 has"
+                )
+            floats[field.name] = float(value)  # jax takes integers of at most 32 bits
+    return dataclasses.replace(record, **floats)
 
 
 def _check_shapes(found: Mapping[str, tuple[int, ...]], config: NetworkConfig) -> None:

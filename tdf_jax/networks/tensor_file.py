@@ -121,7 +121,7 @@ def _kind(path: Path) -> str:
         raise Refusal(f"it is a pickle or PyTorch's old format, not a zip archive; {RESAVE}")
     for beginning, what, fix in OTHER_KINDS:
         if start.lstrip().startswith(beginning):
-            raise Refusal(f"it is not a PyTorch checkpoint: {what}; {fix}")
+            raise Refusal(f"it is not a PyTorch checkpoint: {what}; expected a file from torch.save: {fix}")
     raise Refusal("it is not a PyTorch checkpoint: it does not begin as a zip archive; expected a file from torch.save")
 
 
