@@ -127,7 +127,7 @@ class Demonstration:
         transfer = resample(self.transfer, num_poses)
         parts = (self.approach, transfer, self.retreat)
         poses = jnp.concatenate([jnp.asarray(part.wxyz_xyz) for part in parts])
-        last = self._first + num_poses - 1
+        last = self.release if self.release < 0 else self._first + num_poses - 1
         return dataclasses.replace(self, trajectory=Trajectory(poses), grasp=self._first, release=last)
 
     def _check_query(self) -> None:

@@ -147,8 +147,10 @@ def optimize(
     result = Result(trajectories, block[:, 0], history, initial, history)
     if device_mesh is None:
         return with_ends(result, reference)
-    # Fields that are unknown are scalars of this process.
-    result = jax.tree.map(lambda part: jnp.asarray(devices.gathered(part)[:num_starts]) if part.ndim else part, result)
+    # Fields that are unknown or empty are numpy arrays of this process.
+    result = jax.tree.map(
+        lambda part: part if isinstance(part, np.ndarray) else jnp.asarray(devices.gathered(part)[:num_starts]), result
+    )
     return with_ends(result, demonstrated)
 
 

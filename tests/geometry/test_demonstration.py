@@ -41,6 +41,9 @@ def test_a_recording_has_three_parts(recording):
 def test_resampling_changes_the_part_between_grasp_and_release_only(recording):
     longer = recording.resampled(7)
     assert (longer.grasp, longer.release, longer.trajectory.num_poses) == (3, 9, 12)
+    counted = dataclasses.replace(recording, release=-3).resampled(7)
+    assert (counted.grasp, counted.release) == (3, -3)
+    np.testing.assert_array_equal(counted.trajectory.wxyz_xyz, longer.trajectory.wxyz_xyz)
     np.testing.assert_array_equal(longer.approach.wxyz_xyz, recording.approach.wxyz_xyz)
     np.testing.assert_array_equal(longer.retreat.wxyz_xyz, recording.retreat.wxyz_xyz)
     np.testing.assert_allclose(longer.transfer.matrices, tdf.resample(recording.transfer, 7).matrices, atol=1e-6)

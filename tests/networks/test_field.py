@@ -263,7 +263,8 @@ def test_clouds_of_many_sizes_run_one_program_and_what_fills_them_up_does_not_co
         np.testing.assert_allclose(field.latent, plain, atol=5e-6 * np.abs(plain).max())  # rounding of float32
         np.testing.assert_allclose(field.origin, cloud.mean(axis=0), atol=1e-7)
         traced = jax.jit(lambda points: tdf.encode(model, points))(cloud)
-        np.testing.assert_allclose(traced.latent, field.latent, atol=2e-6 * np.abs(plain).max())
+        # The traced cloud is centred in float32.
+        np.testing.assert_allclose(traced.latent, field.latent, atol=5e-6 * np.abs(plain).max())
 
 
 @pytest.mark.slow

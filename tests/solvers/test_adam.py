@@ -241,7 +241,7 @@ def test_mixed_precisions_promote(field, reference, result):
     with jax.enable_x64(True):
         mixed = dataclasses.replace(reference, query=jnp.asarray(reference.query, jnp.float64))
         double = run(field, mixed, starts=result.initial_trajectories)
-        assert {x.dtype for x in jax.tree.leaves(double) if x.ndim} == {jnp.dtype("float64")}
+        assert {x.dtype for x in jax.tree.leaves(double) if x.ndim and x.size} == {jnp.dtype("float64")}
         np.testing.assert_allclose(double.candidate_history[:, 0], result.candidate_history[:, 0], rtol=1e-4)
 
 
