@@ -145,9 +145,6 @@ def campaign(folder: Path, kills: int, seed: int, commands=tuple(COMMANDS)) -> l
     while sum(len(record["kills"]) for record in records) < kills:
         name = commands[len(records) % len(commands)]
         expected, first, last = undisturbed(folder, name)
-        # On a machine that is less busy than before, runs end before they are killed.
-        idle = sum(not record["kills"] for record in records if record["command"] == name)
-        last = first + (last - first) * 0.7**idle
         rng = np.random.default_rng([seed, len(records)])
         record = run_through(folder, name, expected, first, last, rng, number=len(records))
         records.append(record)
