@@ -65,12 +65,15 @@ def files(pattern: str) -> Callable[[Path], dict[str, object]]:
 
 
 def steps(folder: Path) -> dict[str, object]:
-    """Steps of the checkpoint of a training run."""
+    """Steps up to the checkpoint of a training run, each with the time that its metrics have."""
     from flax import serialization
 
-    path = folder / "out" / "state.msgpack"
-    done = int(serialization.msgpack_restore(path.read_bytes())["step"]) if path.exists() else 0
-    return {f"step {step}": True for step in range(1, done + 1)}
+    path, metrics = folder / "out" / "state.msgpack", folder / "out" / "metrics.jsonl"
+    if not path.exists():
+        return {}
+    done = int(serialization.msgpack_restore(path.read_bytes())["step"])
+    rows = [json.loads(line) for line in metrics.read_text().split("\n")[:-1]]
+    return {f"step {row['step']}": row["seconds"] for row in rows if row["step"] <= done}
 
 
 def tiles(folder: Path) -> dict[str, object] | None:
