@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-all check bench clean
+.PHONY: demo test test-all test-types check bench clean
 
 demo: $(VENV)/.installed
 	$(BIN)/tdf imitate --out imitation
@@ -14,6 +14,11 @@ test: $(VENV)/.installed-test
 
 test-all: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -rs
+
+# Every annotation of these packages is checked as their functions run, shapes included.
+TYPED := geometry io networks energy landscape shapes
+test-types: $(VENV)/.installed-dev
+	TDF_CHECK_TYPES="$(TYPED)" $(BIN)/python -m pytest -m "not slow" $(TYPED:%=tests/%)
 
 check: $(VENV)/.installed-check
 	$(BIN)/ruff format --check .

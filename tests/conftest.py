@@ -26,9 +26,11 @@ from scipy.spatial.transform import Rotation
 
 if "TDF_CHECK_TYPES" in os.environ:  # as `make test-types` does: every annotation is checked, shapes included
     import jaxtyping
+    import typecheck
 
-    CHECKED = ("geometry", "io", "networks", "energy", "landscape", "shapes")
+    CHECKED = os.environ["TDF_CHECK_TYPES"].split()
     jaxtyping.install_import_hook([f"tdf_jax.{package}" for package in CHECKED], "typecheck.checked")
+    pytest.raises = typecheck.raises
 
 import tdf_jax as tdf
 from tdf_jax.networks.field import DescriptorField

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import jax
 import jax.numpy as jnp
@@ -90,7 +90,7 @@ class Reference:
 @public
 def describe(
     model: Model,
-    demonstrations: Demonstration | Sequence[Demonstration],
+    demonstrations: Demonstration | Iterable[Demonstration],
     combine: str = "mean",
     *,
     target_model: Model | None = None,

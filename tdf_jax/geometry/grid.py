@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Real
 from numpy.typing import ArrayLike
 
 from tdf_jax._internal import checks
@@ -37,7 +37,7 @@ class Grid:
 
     origin: Float[np.ndarray, "3"]
     directions: Float[np.ndarray, "axes 3"]
-    coordinates: tuple[Float[np.ndarray, " count"], ...]
+    coordinates: tuple[Real[np.ndarray, " _count"], ...]
     mask: Bool[np.ndarray, "*shape"] | None = None
 
     def __post_init__(self):

@@ -20,7 +20,7 @@ from tdf_jax._internal.errors import InputError
 def box_query(
     key: PRNGKeyArray,
     count: int = 500,
-    size: float | Sequence[float] = 0.08,
+    size: float | Sequence[float] | Float[Array, "..."] = 0.08,
     centre: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Float[Array, "queries 3"]:
     """Sample query points uniformly in a box whose edges are along the axes of the query frame.
@@ -39,14 +39,14 @@ def box_query(
     """
     checks.key("box_query()", key)
     checks.count("box_query()", "count", count)
-    edges = checks.lengths("box_query()", "size", [size] * 3 if np.ndim(size) == 0 else size)
+    edges = checks.lengths("box_query()", "size", [size] * 3 if np.ndim(size) == 0 else size)  # pyright: ignore[reportArgumentType]
     middle = jnp.asarray(checks.vector("box_query()", "centre", centre))
     return middle + edges * jax.random.uniform(key, (count, 3), minval=-0.5, maxval=0.5)
 
 
 @public
 def gaussian_query(
-    key: PRNGKeyArray, count: int = 500, sigma: float = 0.025, centre: ArrayLike = (0.0, 0.0, 0.0)
+    key: PRNGKeyArray, count: int = 500, sigma: float | Float[Array, ""] = 0.025, centre: ArrayLike = (0.0, 0.0, 0.0)
 ) -> Float[Array, "queries 3"]:
     """Sample query points from a normal distribution; the default sigma is that of NDF's demonstrations.
 

@@ -25,10 +25,11 @@ class Trajectory:
     x_world = R_i x_query + t_i.
 
     Attributes:
-        wxyz_xyz: poses, (poses, 7), quaternion then translation in metres, world frame: the layout of `jaxlie.SE3`.
+        wxyz_xyz: poses, (poses, 7), quaternion then translation in metres, world frame: the layout of `jaxlie.SE3`;
+            (..., poses, 7) in a batch of trajectories.
     """
 
-    wxyz_xyz: Float[Array, "poses 7"]
+    wxyz_xyz: Float[Array, "*batch poses 7"]
 
     @property
     def num_poses(self) -> int:

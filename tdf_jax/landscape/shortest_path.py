@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -17,7 +18,7 @@ SHARPEST = 50.0  # energies differ by a factor of about 10, so costs span 50 dec
 
 @public
 def lowest_cost_path(
-    landscape: Landscape, start: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"], sharpness: float = 1.0
+    landscape: Landscape, start: ArrayLike, goal: ArrayLike, sharpness: float = 1.0
 ) -> Float[np.ndarray, "corners 3"]:
     """Compute the path from start to goal that minimises the integral of energy^sharpness over its length.
 

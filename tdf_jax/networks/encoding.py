@@ -6,7 +6,7 @@ import warnings
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Real
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import public
@@ -33,7 +33,7 @@ UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254}
 @public
 @renamed_keywords(thinnings="num_subsamples")
 def encode(
-    model: Model, points: Float[Array | np.ndarray, "points 3"], num_subsamples: int = NUM_SUBSAMPLES
+    model: Model, points: Real[Array | np.ndarray, "points 3"], num_subsamples: int = NUM_SUBSAMPLES
 ) -> DescriptorField:
     """Encode an object's point cloud into its descriptor field.
 

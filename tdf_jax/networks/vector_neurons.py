@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-Vectors = tuple[Float[Array, "points channels"], Float[Array, "points channels"], Float[Array, "points channels"]]
+Vectors = tuple[Float[Array, "... _channels"], Float[Array, "... _channels"], Float[Array, "... _channels"]]
 
 VECTOR_EPSILON = 1e-6  # added to |d|^2 in the vector leaky ReLU, as in the original
 NEIGHBOUR_ROWS = 2048  # points whose distances to all others are in memory at a time

@@ -14,6 +14,7 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import POSE_NORMS, pose_energy, waypoint_loss
 from tdf_jax.energy.reference import Reference
 from tdf_jax.geometry import se3
+from tdf_jax.networks.field import DescriptorField
 
 HALF = np.sqrt(0.5)
 QUARTER_TURN_Z = [HALF, 0, 0, HALF]
@@ -95,10 +96,13 @@ def test_the_loss_of_every_waypoint_and_its_gradients_are_the_originals(
 # ---- hand-computed cases ----
 
 
-class Coordinates:
+class Coordinates(DescriptorField):
     """A field whose three channels are the coordinates relative to its origin."""
 
     origin = jnp.array([1.0, 2.0, 3.0])
+
+    def __init__(self):
+        """It has no decoder."""
 
     def descriptors(self, x):
         return x - self.origin

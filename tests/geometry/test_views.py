@@ -81,7 +81,7 @@ def test_a_view_of_a_sphere_is_its_cap():
 
 def test_views_are_merged_without_repeats():
     points = sphere()
-    cameras = 4 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0]])
+    cameras = 4.0 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0]])
     merged = merge_views(points, cameras)
     union = {tuple(point) for camera in cameras for point in single_view(points, camera)}
     assert len(merged) == len(union)

@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import re
 from types import SimpleNamespace
 
 import jax
@@ -35,7 +36,7 @@ def make_model(**info):
     return Model(unflatten_dict(flat, sep="."), CONFIG, ModelInfo(**{"name": "mug", "source": "a test", **info}))
 
 
-def with_tensor(name, array):
+def altered(name, array):
     flat = flatten_dict(make_model().params, sep=".") | {name: array}
     return dataclasses.replace(make_model(), params=unflatten_dict(flat, sep="."))
 
@@ -277,7 +278,8 @@ def test_non_finite_weights_are_named(saved, bad):
 )
 def test_headers_that_describe_no_model(saved, field, value, reason):
     rewrite(saved, header={field: value}, checksum=True)
-    assert reason in refusal(saved)
+    with pytest.raises(InputError, match=rf"(?s)^load_model\(\): .*{re.escape(reason)}"):
+        load_model(saved)
 
 
 # --- models that cannot be written ---
@@ -286,18 +288,23 @@ def test_headers_that_describe_no_model(saved, field, value, reason):
 @pytest.mark.parametrize(
     ("model", "reason"),
     [
-        (with_tensor("decoder.fc_out.bias", np.zeros(1)), "got decoder.fc_out.bias float64"),
-        (with_tensor("decoder.fc_out.bias", np.float32([np.nan])), "NaN or infinite values in decoder.fc_out.bias"),
-        (with_tensor("decoder.fc_out.bias", np.zeros(2, np.float32)), "decoder.fc_out.bias is (2,), expected (1,)"),
-        (with_tensor("decoder.extra", np.zeros(2, np.float32)), "not expected: decoder.extra"),
-        (make_model(cloud_points=2.5), "ModelInfo.cloud_points is a float"),
+        (lambda: altered("decoder.fc_out.bias", np.zeros(1)), "got decoder.fc_out.bias float64"),
+        (
+            lambda: altered("decoder.fc_out.bias", np.float32([np.nan])),
+            "NaN or infinite values in decoder.fc_out.bias",
+        ),
+        (
+            lambda: altered("decoder.fc_out.bias", np.zeros(2, np.float32)),
+            "decoder.fc_out.bias is (2,), expected (1,)",
+        ),
+        (lambda: altered("decoder.extra", np.zeros(2, np.float32)), "not expected: decoder.extra"),
+        (lambda: make_model(cloud_points=2.5), "ModelInfo.cloud_points is a float"),
     ],
 )
 def test_what_could_not_be_loaded_is_not_saved(saved, model, reason):
     before = saved.read_bytes()
-    with pytest.raises(InputError, match=r"^save_model\(\): ") as caught:
-        save_model(model, saved)
-    assert reason in str(caught.value)
+    with pytest.raises(InputError, match=rf"(?s)^save_model\(\): .*{re.escape(reason)}"):
+        save_model(model(), saved)
     assert saved.read_bytes() == before
 
 

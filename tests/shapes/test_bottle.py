@@ -1,5 +1,6 @@
 """The bottle family: dimensions, places, symmetry, errors, and the range of sampled dimensions."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -316,9 +317,8 @@ RISE = "expected edge_radius, shoulder_bottom, shoulder_top and height to rise i
     ({"cap_height": 0.0, "mouth_depth": 0.082}, "mouth_depth must be less than the height of neck and shoulder"),
 ])  # fmt: skip
 def test_bad_dimensions_are_refused_by_name(change, message):
-    with pytest.raises(InputError, match=r"build_bottle\(\)") as error:
+    with pytest.raises(InputError, match=rf"(?s)build_bottle\(\).*{re.escape(message)}"):
         build_bottle(replace(PLAIN, **change))
-    assert message in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -345,9 +345,8 @@ def test_bad_dimensions_are_refused_by_name(change, message):
     ],
 )
 def test_bad_handles_are_refused_by_name(change, message):
-    with pytest.raises(InputError, match=r"build_bottle\(\)") as error:
+    with pytest.raises(InputError, match=rf"(?s)build_bottle\(\).*{re.escape(message)}"):
         build_bottle(replace(PLAIN, handle=True, **change))
-    assert message in str(error.value)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """The bowl family: closed meshes of given dimensions, places on the material, and the range of sampled dimensions."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -260,9 +261,8 @@ def test_sampled_bowls_are_built_and_have_every_symmetry():
     ],
 )
 def test_bad_dimensions_are_refused_by_name(change, message):
-    with pytest.raises(InputError, match=r"build_bowl\(\)") as error:
+    with pytest.raises(InputError, match=rf"(?s)build_bowl\(\).*{re.escape(message)}"):
         build_bowl(replace(PLAIN, **change))
-    assert message in str(error.value)
 
 
 @pytest.mark.parametrize(

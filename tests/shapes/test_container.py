@@ -1,5 +1,6 @@
 """The container family: closed meshes of given dimensions, floor and opening, and room for what is to stand inside."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -220,9 +221,8 @@ def test_containers_of_anything_are_built():
     ],
 )
 def test_bad_dimensions_are_refused_by_name(change, message):
-    with pytest.raises(InputError, match=r"build_container\(\)") as error:
+    with pytest.raises(InputError, match=rf"(?s)build_container\(\).*{re.escape(message)}"):
         build_container(replace(PLAIN, **change))
-    assert message in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -234,6 +234,5 @@ def test_bad_dimensions_are_refused_by_name(change, message):
     ],
 )
 def test_sizes_of_nothing_are_refused(sizes, message):
-    with pytest.raises(InputError, match=r"sample_container\(\)") as error:
+    with pytest.raises(InputError, match=rf"(?s)sample_container\(\).*{re.escape(message)}"):
         sample_container(np.random.default_rng(0), **sizes)
-    assert message in str(error.value)

@@ -1,5 +1,6 @@
 """Generated objects: closed meshes, ground truth frames, an exact inside test, true symmetries; and the mug family."""
 
+import re
 import subprocess
 import sys
 from dataclasses import asdict, replace
@@ -459,9 +460,8 @@ def test_scaled_scales_mesh_frames_parameters_and_contains():
     ],
 )
 def test_bad_dimensions_are_refused_by_name(change, message):
-    with pytest.raises(InputError, match=r"build_mug\(\)") as error:
+    with pytest.raises(InputError, match=rf"(?s)build_mug\(\).*{re.escape(message)}"):
         build_mug(replace(MugParameters(), **change))
-    assert message in str(error.value)
 
 
 @pytest.mark.parametrize("category, name", [(name, name.capitalize()) for name in PARAMETERS])

@@ -1,5 +1,6 @@
 """The rack family: closed meshes of given dimensions, pegs and their seats, and the range of sampled dimensions."""
 
+import re
 from dataclasses import replace
 from typing import Any, cast
 
@@ -250,6 +251,5 @@ def test_most_sampled_mugs_hang_on_sampled_racks():
     ],
 )
 def test_bad_dimensions_are_refused_by_name(change, message):
-    with pytest.raises(InputError, match=r"build_rack\(\)") as error:
+    with pytest.raises(InputError, match=rf"(?s)build_rack\(\).*{re.escape(message)}"):
         build_rack(replace(PLAIN, **change))
-    assert message in str(error.value)

@@ -92,6 +92,30 @@ def test_energies_and_gradients_are_those_of_the_energy(field, reference, pose_n
     np.testing.assert_allclose(values[1], gradient, atol=1e-4 * np.abs(gradient).max())
 
 
+@pytest.mark.parametrize("pose_norm", ["metres_radians", "mean_absolute"])
+def test_differences_of_poses_and_their_gradients_are_those_of_the_energy(reference, pose_norm):
+    """The part of the test above that depends on the norm, for one pose."""
+    weights = tdf.EnergyWeights(0.3, 0.0, 0.2, pose_norm)
+    one = dataclasses.replace(reference, trajectory=jax.tree.map(lambda part: part[:1], reference.trajectory))
+    R, t, origin = (
+        se3.rotation(jnp.asarray(random_poses(1, 1), jnp.float32))[0],
+        jnp.array([0.1, -0.2, 0.3]),
+        jnp.array([0.0, 0.1, 0.0]),
+    )
+    centre = jnp.array([0.02, 0.01, -0.03])
+
+    def energy(step):
+        turned, place = moved(R, R @ centre + t, step)
+        return pose_energy(turned[None], (place - turned @ centre)[None], origin, one, weights)
+
+    loss, gradient, _ = jax.jit(gauss_newton._prior)(
+        R, R @ centre + t, one.trajectory.wxyz_xyz[0], origin, centre, weights
+    )
+    expected, slope = jax.jit(jax.value_and_grad(energy))(jnp.zeros(6))
+    np.testing.assert_allclose(loss, expected, rtol=1e-5)
+    np.testing.assert_allclose(gradient, slope, atol=1e-5)
+
+
 def test_the_curvature_is_that_of_reweighted_squares(field, reference):
     problem = solve._problem(KEY, reference, 8)
     R, place = (
