@@ -9,4 +9,5 @@ Modules:
     errors: the exception of a user's mistake, and warnings
     files: atomic writes
     precision: full float32 products on every device
+    units: units of length
 """

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from tdf_jax._internal.boundary import is_foreign, plain_array
 from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.units import MILLIMETRES
 
 SEEDS = 2**32  # jax truncates a larger seed to 32 bits without a warning
 # Metres. Up to 256 m float32 numbers are at most 0.008 mm from any coordinate. A pick is the sum of a few of them, and
@@ -229,7 +230,7 @@ def near(function: str, name: str, coordinates: np.ndarray, given=None) -> None:
     farthest = np.abs(coordinates).max(initial=0.0)
     if farthest > FARTHEST:
         wide = len(coordinates) < 2 or np.ptp(coordinates, axis=0).max() > SMALLEST_IN_MILLIMETRES
-        unit = " If they are in millimetres, multiply them by 0.001" if wide else ""
+        unit = f" If they are in {MILLIMETRES.name}, multiply them by {MILLIMETRES.metres:g}" if wide else ""
         raise InputError(
             f"{function}: {name} has coordinates of up to {farthest:.6g} m; expected at most {FARTHEST:g} m from the "
             f"origin, because float32 does not resolve 0.1 mm there.{unit} Subtract one offset from all clouds and "

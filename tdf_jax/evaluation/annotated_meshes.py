@@ -27,6 +27,7 @@ from jaxtyping import Bool, Float
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.units import CENTIMETRES, INCHES, METRES, MILLIMETRES
 from tdf_jax.evaluation.axis_profiles import profile, profile_places
 from tdf_jax.evaluation.places import body, measured_places
 from tdf_jax.geometry.symmetry import FOLDS
@@ -43,7 +44,8 @@ EXPECTED = 'expected {"mug.obj": {"unit": 1, "up": "+z", "handle": "+x"}, ...}'
 MOST_NAMED = 5  # meshes without an entry in a message
 MEASURED = ("mug", "bowl", "bottle")  # categories whose places can be measured
 DIAGONALS = (0.03, 1.0)  # metres; another diagonal means that the unit is probably wrong
-UNITS = (1.0, 0.01, 0.001, 0.0254)  # metres, centimetres, millimetres, inches
+# With metres, because the entry may name another unit, and with inches, because the message lists all units that fit.
+PROBABLE_UNITS = (METRES, CENTIMETRES, MILLIMETRES, INCHES)
 OFF_FRONT = 10.0  # degrees, the largest angle between `front` and the longer side
 
 
@@ -302,8 +304,8 @@ def _check_size(path: Path, mesh, unit: float) -> None:
     diagonal = float(np.linalg.norm(mesh.extents))
     if low <= diagonal <= high:
         return
-    likely = [other for other in UNITS if low <= diagonal / unit * other <= high]
-    hint = f"; try {' or '.join(f'{other:g}' for other in likely)}" if likely else ""
+    likely = [f"{metres:g}" for _, metres, _ in PROBABLE_UNITS if low <= diagonal / unit * metres <= high]
+    hint = f"; try {' or '.join(likely)}" if likely else ""
     raise InputError(
         f"load_annotated(): {path.name} has a diagonal of {diagonal:.4g} m with unit {unit:g}; expected {low:g} to "
         f"{high:g} m; correct its unit in {SIDECAR}{hint}"

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from tdf_jax._internal.units import UNITS
 from tdf_jax.io.content import UnsupportedError
 from tdf_jax.io.text import decode, numbers
 
@@ -16,9 +17,7 @@ MOST_COLUMNS = 20  # with a normal, a colour, an intensity and some features; a 
 _NAME = re.compile(
     r"(?:points?[_:. ]*|pos(?:ition)?[_:. ]*|coord[_:. ]*)?([xyz012])[\s_]*(?:[\[(/]?\s*([a-z]+)\s*[\])]?)?"
 )
-_UNITS = {"mm": 1e-3, "cm": 1e-2, "dm": 1e-1, "m": 1.0, "km": 1e3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
-_UNITS |= {"metre": 1.0, "metres": 1.0, "meter": 1.0, "meters": 1.0, "inch": 0.0254, "inches": 0.0254}
-_UNITS |= {"millimetres": 1e-3, "millimeters": 1e-3, "centimetres": 1e-2, "centimeters": 1e-2}
+_METRES = {spelling: unit.metres for unit in UNITS for spelling in unit.spellings}
 _NAME_THEM = "or write the names of all columns into the first line of a text, such as x y z r g b"
 _MISSING = {"", "null", "none", "na", "n/a", "-", "--"}
 _MIXED = "has numbers with commas as well as points; expected decimal points only; remove the commas"
@@ -190,7 +189,7 @@ def named_columns(names: Sequence[str]) -> tuple[list[int], str | None] | None:
     found, units = {}, set()
     for column, name in enumerate(names):
         match = _NAME.fullmatch(name.strip().strip("\"'").strip().lower())
-        if not match or (match[2] and match[2] not in _UNITS) or (match[1].isdigit() and len(name.strip("\"' ")) < 3):
+        if not match or (match[2] and match[2] not in _METRES) or (match[1].isdigit() and len(name.strip("\"' ")) < 3):
             continue
         axis = "xyz"[int(match[1])] if match[1].isdigit() else match[1]
         if axis in found:
@@ -212,10 +211,10 @@ def check_unit(unit: str | None, scale: float) -> None:
     Raises:
         UnsupportedError: the two differ.
     """
-    if unit is None or np.isclose(scale, _UNITS[unit], rtol=1e-6, atol=0.0):
+    if unit is None or np.isclose(scale, _METRES[unit], rtol=1e-6, atol=0.0):
         return
     given = "" if scale == 1 else f", and scale is {scale:g}"
-    fix = "leave out scale" if _UNITS[unit] == 1 else f"pass scale={_UNITS[unit]:g}"
+    fix = "leave out scale" if _METRES[unit] == 1 else f"pass scale={_METRES[unit]:g}"
     raise UnsupportedError(f"has coordinates in {unit}, as its names say{given}; {fix}, or correct the names")
 
 

@@ -11,6 +11,7 @@ from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import public
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
+from tdf_jax._internal.units import CENTIMETRES, MILLIMETRES
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.target import Target
@@ -24,7 +25,8 @@ TARGET_ARRAYS = ("target_points", "contact_query", "T_world_contact")
 SCHEMA, TARGET_SCHEMA = 2, 3
 # Diagonals of a cloud between which its unit may be metres: a grain of rice and a van.
 SMALLEST, LARGEST = 0.003, 10.0
-UNITS = {"millimetres": 0.001, "centimetres": 0.01}
+# Without inches, because the size of the object is unknown here, and inches and centimetres are both plausible then.
+PROBABLE_UNITS = (MILLIMETRES, CENTIMETRES)
 LARGEST_QUERY = 3.0  # largest diagonal of the query points, diagonals of the cloud
 # Largest distance of the query points' centroid from the object at the grasp, diagonals of the cloud. Remote query
 # points are legitimate, but descriptors fade with the distance (figure 3 of the paper).
@@ -154,8 +156,8 @@ def check_frames(
     pose = np.asarray(trajectory.wxyz_xyz, np.float64)[index]
     diagonal = _diagonal(points)
     if not SMALLEST <= diagonal <= LARGEST:
-        unit = next((unit for unit, metres in UNITS.items() if 0.05 <= diagonal * metres <= 1), None)
-        hint = f"It is probably in {unit}: multiply it by {UNITS[unit]:g}" if unit else "Check its unit"
+        unit = next((unit for unit in PROBABLE_UNITS if 0.05 <= diagonal * unit.metres <= 1), None)
+        hint = f"It is probably in {unit.name}: multiply it by {unit.metres:g}" if unit else "Check its unit"
         raise InputError(
             f"{function}: the cloud has a diagonal of {diagonal:.3g} m; expected an object in metres. {hint}"
         )
@@ -170,7 +172,7 @@ def check_frames(
         return
     inverse = np.asarray(se3.inverse(jnp.asarray(pose)), float)
     explanations = {"the poses are probably T_query_world: invert them": (points, inverse)}
-    for unit, metres in UNITS.items():
+    for unit, metres, _ in PROBABLE_UNITS:
         smaller = np.concatenate([pose[:4], metres * pose[4:]])
         explanations[f"the cloud is probably in {unit}: multiply it by {metres:g}"] = (metres * points, pose)
         explanations[f"the positions are probably in {unit}: multiply them by {metres:g}"] = (points, smaller)

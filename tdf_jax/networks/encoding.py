@@ -13,6 +13,7 @@ from tdf_jax._internal.boundary import public
 from tdf_jax._internal.deprecation import caller_level, renamed_keywords
 from tdf_jax._internal.errors import InputError, SizeWarning
 from tdf_jax._internal.precision import full_precision
+from tdf_jax._internal.units import CENTIMETRES, INCHES, MILLIMETRES
 from tdf_jax.geometry import sampling
 from tdf_jax.networks.field import DescriptorField
 from tdf_jax.networks.model import Model, ModelInfo
@@ -27,7 +28,8 @@ SAME_SIDE = np.pi / 6
 # A cloud of one side of an object is up to two times smaller than the object, and an object in another orientation has
 # another bounding box; a wrong unit is a factor of 39 or more.
 SIZE_TOLERANCE = 3.0
-UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254}
+# With inches, because the size of the training objects distinguishes them from centimetres.
+PROBABLE_UNITS = (MILLIMETRES, CENTIMETRES, INCHES)
 
 
 @public
@@ -118,12 +120,10 @@ def _warn_of_size(info: ModelInfo, cloud: np.ndarray) -> None:
         return
     # Centimetres and inches differ by less than the range of sizes: the unit that fits it best is the likely one.
     middle = np.sqrt(info.smallest_diagonal * info.largest_diagonal)
-    likely = min(UNITS, key=lambda unit: abs(np.log(max(diagonal, 1e-30) * UNITS[unit] / middle)))
-    if not least <= diagonal * UNITS[likely] <= most:
-        likely = None
+    name, metres, _ = min(PROBABLE_UNITS, key=lambda unit: abs(np.log(max(diagonal, 1e-30) * unit.metres / middle)))
     advice = "check its unit, and whether it holds the object alone"
-    if likely is not None:
-        advice = f"it is probably in {likely}: multiply it by {UNITS[likely]:g}, or give --scale {UNITS[likely]:g}"
+    if least <= diagonal * metres <= most:
+        advice = f"it is probably in {name}: multiply it by {metres:g}, or give --scale {metres:g}"
     warnings.warn(
         f"encode(): the bounding box of the cloud has a diagonal of {diagonal:.4g} m, and the weights {info.name!r} "
         f"were trained on objects of {info.smallest_diagonal:g} to {info.largest_diagonal:g} m; {advice}",
