@@ -19,8 +19,8 @@ _MAGIC = {
     b"# .PCD": ".pcd",
     b"#.PCD": ".pcd",
 }
-# What is not a mesh or a cloud at all, with what to do about it.
-_FOREIGN = {
+# First bytes of files of other kinds, what such a file is, and the fix; None if the fix depends on the reader.
+_FOREIGN: dict[bytes, tuple[str, str | None]] = {
     b"version https://git-lfs": ("is a pointer of Git LFS, not the file itself", "run git lfs pull"),
     b"\x1f\x8b": ("is compressed by gzip", "unpack it by gunzip"),
     b"BZh": ("is compressed by bzip2", "unpack it by bunzip2"),
@@ -29,16 +29,18 @@ _FOREIGN = {
     b"PK\x03\x04": ("is a zip archive", "unpack it"),
     b"7z\xbc\xaf": ("is a 7z archive", "unpack it"),
     b"Rar!": ("is a RAR archive", "unpack it"),
-    b"\x89HDF": ("is an HDF5 file", "read the array by h5py and save it by np.save"),
-    b"\x89PNG": ("is a picture", "give the cloud or the mesh"),
-    b"\xff\xd8\xff": ("is a picture", "give the cloud or the mesh"),
-    b"LASF": ("is a LAS cloud", "convert it to .ply"),
-    b"%PDF": ("is a PDF document", "give the cloud or the mesh"),
+    b"\x89HDF": ("is an HDF5 file", None),
+    b"\x89PNG": ("is a picture", None),
+    b"\xff\xd8\xff": ("is a picture", None),
+    b"LASF": ("is a LAS cloud", None),
+    b"%PDF": ("is a PDF document", None),
     b"<!doctype html": ("is a web page", "download the file itself"),
     b"<html": ("is a web page", "download the file itself"),
 }
-
-
+_FIXES = {
+    "is an HDF5 file": "read the array by h5py and save it by np.save",
+    "is a LAS cloud": "convert it to .ply",
+}
 _SPACING = 1e-3  # metres between neighbouring numbers of a file, above which a shape is not what was measured
 
 
@@ -101,6 +103,20 @@ def reading(function: str, path: Path) -> Iterator[None]:
         raise InputError(f"{function}: {path} cannot be read as {suffix} ({reason}); save it again") from error
 
 
+def foreign_kind(data: bytes) -> tuple[str, str | None] | None:
+    """Recognise a file that is no mesh, cloud or checkpoint at all, such as a web page.
+
+    Args:
+        data: content of the file, or its first 512 bytes.
+
+    Returns:
+        What it is, such as "is a web page", and the fix, which is None if it depends on the reader; None for the pair
+        if the kind is not known.
+    """
+    start = data[:512].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
+    return next((kind for magic, kind in _FOREIGN.items() if start.startswith(magic.lower())), None)
+
+
 def file_bytes(path: Path) -> bytes:
     """Read the bytes of a file, unless they are plainly of another kind than the suffix says.
 
@@ -118,11 +134,11 @@ def file_bytes(path: Path) -> bytes:
     data, suffix = path.read_bytes(), path.suffix.lower()
     if not data:
         raise ValueError("it is empty, 0 bytes")
-    for magic, (kind, fix) in _FOREIGN.items():
-        if suffix == ".npz":  # itself a zip archive, of arrays
-            break
-        if data[:512].lstrip(b"\xef\xbb\xbf \t\r\n").lower().startswith(magic.lower()):
-            raise UnsupportedError(f"{kind}; expected the content of a {suffix} file; {fix}")
+    foreign = foreign_kind(data)
+    if foreign is not None and suffix != ".npz":  # which is itself a zip archive, of arrays
+        kind, fix = foreign
+        fix = fix or _FIXES.get(kind, "give the cloud or the mesh")
+        raise UnsupportedError(f"{kind}; expected the content of a {suffix} file; {fix}")
     for magic, other in _MAGIC.items():
         if data.startswith(magic) and suffix != other and {suffix, other} != {".glb", ".gltf"}:
             raise UnsupportedError(f"holds the content of a {other} file; expected {suffix}; rename it to {other}")

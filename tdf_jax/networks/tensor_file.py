@@ -16,6 +16,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from tdf_jax.io.content import foreign_kind
 from tdf_jax.networks.torch_pickle import STORAGE_LIMIT, Refusal, Tensor, Unknown, Unusable, interpret
 
 PICKLE_LIMIT = 2**20  # bytes; that of the published network has 10 kB
@@ -27,17 +28,13 @@ RESAVE = (
     "content than tensors, torch.load needs weights_only=False"
 )
 SAVE = 'save the network\'s tensors alone with PyTorch: torch.save(model.state_dict(), "new.pth")'
-# What a file of another kind begins with, what it is, and what to do.
-OTHER_KINDS = (
-    (b"\x1f\x8b", "it is compressed by gzip", "unpack it"),
-    (b"BZh", "it is compressed by bzip2", "unpack it"),
-    (b"\xfd7zXZ", "it is compressed by xz", "unpack it"),
-    (b"version https://git-lfs", "it is a pointer of Git LFS, and not the file", "run git lfs pull"),
-    (b"<", "it is a web page or XML, such as the message of a failed download", "download it again"),
-    (b"{", "it is JSON, such as the index of a checkpoint in several files", f"load them in PyTorch, and {SAVE}"),
-    (b"\x89HDF", "it is HDF5, as of Keras", f"load it there, and {SAVE}"),
-    (b"\x93NUMPY", "it is a NumPy array", "name the PyTorch checkpoint"),
-)
+# As the table of `io/content.py`, of files that are foreign only here: its readers take JSON and NumPy arrays.
+OTHER_KINDS = {
+    b"<": ("is XML, such as the message of a failed download", "download it again"),
+    b"{": ("is JSON, such as the index of a checkpoint in several files", f"load them in PyTorch, and {SAVE}"),
+    b"\x93NUMPY": ("is a NumPy array", None),
+}
+FIXES = {"is an HDF5 file": f"load it where it was saved, such as in Keras, and {SAVE}"}
 FLOATS = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "BF16": "bfloat16"}  # by their names in safetensors
 
 
@@ -119,10 +116,10 @@ def _kind(path: Path) -> str:
         raise Refusal(f"it is a tar archive with {names[0]} in it; unpack it")
     if start.startswith(b"\x80") or tar:
         raise Refusal(f"it is a pickle or PyTorch's old format, not a zip archive; {RESAVE}")
-    for beginning, what, fix in OTHER_KINDS:
-        if start.lstrip().startswith(beginning):
-            raise Refusal(f"it is not a PyTorch checkpoint: {what}; expected a file from torch.save: {fix}")
-    raise Refusal("it is not a PyTorch checkpoint: it does not begin as a zip archive; expected a file from torch.save")
+    others = (kind for beginning, kind in OTHER_KINDS.items() if start.lstrip().startswith(beginning))
+    what, fix = foreign_kind(start) or next(others, ("does not begin as a zip archive", None))
+    fix = fix or FIXES.get(what, "name the PyTorch checkpoint")
+    raise Refusal(f"it is not a PyTorch checkpoint: it {what}; expected a file from torch.save: {fix}")
 
 
 def _tar_members(path: Path) -> list[str]:
