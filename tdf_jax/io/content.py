@@ -48,6 +48,26 @@ class UnsupportedError(ValueError):
     """Raised for a valid file that uses what is not read; the message says what, what is expected and the fix."""
 
 
+def known_suffix(function: str, path: str | Path, suffixes: tuple[str, ...]) -> Path:
+    """Check that a path has one of several suffixes, in lower or upper case.
+
+    Args:
+        function: name that error messages begin with.
+        path: file to read or to write.
+        suffixes: known suffixes, in lower case.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: the suffix is unknown.
+    """
+    path = checks.path(function, path)
+    if path.suffix.lower() not in suffixes:
+        raise InputError(f"{function}: {path} has suffix {path.suffix!r}; expected one of {', '.join(suffixes)}")
+    return path
+
+
 def existing_file(function: str, path: str | Path, suffixes: tuple[str, ...], scale: float) -> Path:
     """Check that a file exists and has a known suffix, and that its scale is positive.
 
@@ -63,9 +83,7 @@ def existing_file(function: str, path: str | Path, suffixes: tuple[str, ...], sc
     Raises:
         InputError: the suffix is unknown, the file is missing, or scale is not above 0.
     """
-    path = checks.path(function, path)
-    if path.suffix.lower() not in suffixes:
-        raise InputError(f"{function}: {path} has suffix {path.suffix!r}; expected one of {', '.join(suffixes)}")
+    path = known_suffix(function, path, suffixes)
     checks.existing_file(function, path)
     checks.positive(function, "scale", scale, "metres per unit of the file")
     return path

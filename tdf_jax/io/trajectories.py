@@ -9,9 +9,9 @@ import numpy as np
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import public
-from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
 from tdf_jax.geometry.trajectory import Trajectory, check_trajectory
+from tdf_jax.io.content import UnsupportedError, known_suffix, reading
 
 
 @public
@@ -25,7 +25,7 @@ def save_trajectory(path: str | Path, trajectory: Trajectory) -> None:
     Raises:
         InputError: the suffix is unknown, the file cannot be written, or the trajectory fails `check_trajectory`.
     """
-    path = _known_suffix("save_trajectory()", path, (".npz", ".tum"))
+    path = known_suffix("save_trajectory()", path, (".npz", ".tum"))
     wxyz_xyz = np.asarray(check_trajectory(trajectory).wxyz_xyz)
 
     def write(file: BinaryIO) -> None:
@@ -55,16 +55,10 @@ def load_trajectory(path: str | Path) -> Trajectory:
         InputError: the file is missing, unreadable or of another dialect, its poses fail `check_trajectory`, or they
             are farther from the origin than float32 resolves.
     """
-    path = _known_suffix("load_trajectory()", path, tuple(_READERS))
+    path = known_suffix("load_trajectory()", path, tuple(_READERS))
     checks.existing_file("load_trajectory()", path)
-    try:
+    with reading("load_trajectory()", path):
         wxyz_xyz = _READERS[path.suffix.lower()](path)
-    except _Dialect as reason:
-        raise InputError(f"load_trajectory(): {path} is not read: {reason}") from None
-    except Exception as error:  # damaged archives raise errors of many kinds
-        raise InputError(
-            f"load_trajectory(): {path} cannot be read as {path.suffix} ({error}); save it again"
-        ) from error
     # In numpy, because far coordinates and bad norms must be seen before they are rounded.
     check_trajectory(Trajectory(wxyz_xyz), str(path))  # pyright: ignore[reportArgumentType]
     checks.near("load_trajectory()", str(path), wxyz_xyz[:, 4:])
@@ -87,13 +81,13 @@ def _read_tum(path: Path) -> np.ndarray:
         names = [word.lower() for word in re.split(r"[\s,;]+", line.partition("#")[2]) if word]
         quaternion = [name for name in names if name in ("qw", "qx", "qy", "qz")]
         if len(quaternion) == 4 and quaternion != ["qx", "qy", "qz", "qw"]:
-            raise _Dialect(
-                f"its comment names the order {' '.join(quaternion)}; expected TUM's, qx qy qz qw at the end"
+            raise UnsupportedError(
+                f"has a comment that names the order {' '.join(quaternion)}; expected TUM's, qx qy qz qw at the end"
             )
     lines = [line for line in lines if line.split("#")[0].strip()]
     rows = np.loadtxt(lines, ndmin=2) if lines else np.zeros((0, 8))
     if rows.shape[1] != 8:
-        raise _Dialect(f"it has {rows.shape[1]} columns; expected the 8 of t x y z qx qy qz qw")
+        raise UnsupportedError(f"has {rows.shape[1]} columns; expected the 8 of t x y z qx qy qz qw")
     return rows[:, [7, 4, 5, 6, 1, 2, 3]]
 
 
@@ -104,28 +98,23 @@ def _read_csv(path: Path) -> np.ndarray:
     names = [name.strip(" \"'#").lower() for name in (lines[0].split(separator) if lines else [])]
     missing = [name for name in COLUMNS if name not in names]
     if missing:
-        raise _Dialect(f"its first line names no column {', '.join(missing)}; expected {', '.join(COLUMNS)}")
+        raise UnsupportedError(
+            f"has a first line that names no column {', '.join(missing)}; expected {', '.join(COLUMNS)}"
+        )
     repeated = [name for name in COLUMNS if names.count(name) > 1]
     if repeated:
-        raise _Dialect(f"its first line names {', '.join(repeated)} more than once; expected each column once")
+        raise UnsupportedError(
+            f"has a first line that names {', '.join(repeated)} more than once; expected each column once"
+        )
     rows = [line.split(separator) for line in lines[1:]]
     for number, row in enumerate(rows, 2):
         if len(row) != len(names):
-            raise _Dialect(f"line {number} has {len(row)} values; expected {len(names)}, as the first line names")
+            raise UnsupportedError(
+                f"has {len(row)} values in line {number}; expected {len(names)}, as the first line names"
+            )
     columns = [names.index(name) for name in COLUMNS]
     return np.array([[float(row[column]) for column in columns] for row in rows]).reshape(-1, 7)
 
 
-class _Dialect(Exception):
-    """What an undamaged file has that is not read."""
-
-
 COLUMNS = ("qw", "qx", "qy", "qz", "x", "y", "z")
 _READERS = {".npz": _read_npz, ".tum": _read_tum, ".csv": _read_csv}
-
-
-def _known_suffix(function: str, path: str | Path, suffixes: tuple[str, ...]) -> Path:
-    path = checks.path(function, path)
-    if path.suffix.lower() not in suffixes:
-        raise InputError(f"{function}: {path} has suffix {path.suffix!r}; expected {' or '.join(suffixes)}")
-    return path

@@ -245,7 +245,7 @@ def test_npz_files_with_something_else_are_refused(tmp_path, arrays, message):
 
 def test_wrong_paths(tmp_path):
     for call in (lambda path: save_trajectory(path, line()), load_trajectory):
-        with pytest.raises(InputError, match="suffix '.txt'; expected .npz or .tum"):
+        with pytest.raises(InputError, match="suffix '.txt'; expected one of .npz, .tum"):
             call(tmp_path / "path.txt")
     with pytest.raises(InputError, match="there is no file .*path.tum"):
         load_trajectory(tmp_path / "path.tum")
