@@ -83,6 +83,13 @@ def number(
     return value
 
 
+def real(function: str, name: str, value) -> float:
+    """Check that a value is one number, finite or not; return it as a float."""
+    if not _is_real(value):
+        raise InputError(f"{function}: {name} is {value!r}; expected one number")
+    return float(value)
+
+
 def positive(function: str, name: str, value, unit: str = ""):
     """Check that a value is one finite number above 0; return it."""
     if traced(value):
@@ -408,12 +415,14 @@ def _is_whole(value) -> bool:
 
 
 def _is_number(value) -> bool:
-    if isinstance(value, bool | np.bool_) or np.ndim(value) != 0:
-        return False
     try:
-        return np.asarray(value).dtype.kind in "fiu" and bool(np.isfinite(value))
+        return _is_real(value) and bool(np.isfinite(value))
     except (TypeError, OverflowError):  # not a number, or an integer of more than 64 bits
         return False
+
+
+def _is_real(value) -> bool:
+    return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "fiu"  # a bool has a kind of its own
 
 
 def _scalar(function, name, value):

@@ -42,7 +42,7 @@ class Grid:
 
     def __post_init__(self):
         origin = checks.vector("Grid()", "origin", self.origin)
-        directions = _numbers("Grid()", "directions", self.directions)
+        directions = checks.numbers("Grid()", "directions", self.directions)
         if not isinstance(self.coordinates, Sequence | np.ndarray):
             raise InputError(
                 f"Grid(): coordinates are {self.coordinates!r}; expected one list of numbers for each axis"
@@ -54,7 +54,7 @@ class Grid:
             )
         if not np.allclose(directions @ directions.T, np.eye(len(directions)), atol=ORTHONORMAL_TOLERANCE):
             raise InputError(f"Grid(): directions are {directions.tolist()}; expected perpendicular unit vectors")
-        axes = tuple(_numbers("Grid()", "coordinates", steps) for steps in self.coordinates)
+        axes = tuple(checks.numbers("Grid()", "coordinates", steps) for steps in self.coordinates)
         for name, steps in zip("first second third".split(), axes):
             if steps.ndim != 1 or len(steps) < 2:
                 raise InputError(
@@ -137,7 +137,7 @@ def plane_grid(
                 f"plane_grid(): axes is {axes!r}; expected one of {', '.join(PLANES)}, or two unit vectors"
             )
         axes = np.eye(3)[["xyz".index(axis) for axis in axes]]
-    directions = _numbers("plane_grid()", "axes", axes)
+    directions = checks.numbers("plane_grid()", "axes", axes)
     if directions.shape != (2, 3):
         raise InputError(f"plane_grid(): axes have shape {directions.shape}; expected two vectors (2, 3)")
     return Grid(centre, directions, (steps, steps))
@@ -167,7 +167,7 @@ def volume_grid(
     """
     steps = _symmetric_steps("volume_grid()", half, count)
     centre = np.asarray(checks.vector("volume_grid()", "origin", origin))
-    directions = np.eye(3) if axes is None else _numbers("volume_grid()", "axes", axes)
+    directions = np.eye(3) if axes is None else checks.numbers("volume_grid()", "axes", axes)
     return Grid(centre, directions, (steps, steps, steps))
 
 
@@ -201,7 +201,7 @@ def path_grid(
         checks.positive("path_grid()", name, value, "metres")
     if not step <= radius:
         raise InputError(f"path_grid(): step is {step} and radius {radius}; expected 0 < step <= radius, metres")
-    axes = np.eye(3) if axes is None else _numbers("path_grid()", "axes", axes)
+    axes = np.eye(3) if axes is None else checks.numbers("path_grid()", "axes", axes)
     if axes.shape != (3, 3) or not np.isfinite(axes).all():
         raise InputError(f"path_grid(): axes are {axes.tolist()}; expected three perpendicular unit vectors (3, 3)")
     along = (corners - corners[0]) @ axes.T / step
@@ -237,17 +237,6 @@ def distance_from_polyline(
         along = np.clip((points - start) @ step / max(step @ step, np.finfo(float).tiny), 0, 1)
         distance = np.minimum(distance, np.linalg.norm(points - start - along[:, None] * step, axis=1))
     return distance
-
-
-def _numbers(function: str, name: str, value: ArrayLike) -> np.ndarray:
-    """The value as float64, if it is an array of numbers."""
-    try:
-        array = np.asarray(value)
-    except ValueError:  # rows of different lengths
-        array = np.empty(0, object)
-    if array.dtype.kind not in "fiu":
-        raise InputError(f"{function}: {name} has type {array.dtype}; expected numbers")
-    return array.astype(float)
 
 
 def _symmetric_steps(function: str, half: float, count: int) -> np.ndarray:

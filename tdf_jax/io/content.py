@@ -68,7 +68,7 @@ def known_suffix(function: str, path: str | Path, suffixes: tuple[str, ...]) -> 
     return path
 
 
-def existing_file(function: str, path: str | Path, suffixes: tuple[str, ...], scale: float) -> Path:
+def supported_file(function: str, path: str | Path, suffixes: tuple[str, ...], scale: float) -> Path:
     """Check that a file exists and has a known suffix, and that its scale is positive.
 
     Args:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tdf_jax._internal.errors import InputError
-from tdf_jax.io.content import check_spacing, existing_file, file_bytes, reading
+from tdf_jax.io.content import check_spacing, file_bytes, reading, supported_file
 from tdf_jax.io.gltf import read_gltf
 from tdf_jax.io.obj import read_obj
 from tdf_jax.io.off import read_off
@@ -41,7 +41,7 @@ def load_mesh(path: str | Path, scale: float = 1.0) -> "trimesh.Trimesh":
     Raises:
         InputError: the file is missing, unreadable, of another format, without faces, or not finite.
     """
-    path = existing_file("load_mesh()", path, MESH_SUFFIXES, scale)
+    path = supported_file("load_mesh()", path, MESH_SUFFIXES, scale)
     vertices, faces = read_surface("load_mesh()", path)
     if not len(faces):
         raise InputError(f"load_mesh(): {path} has no faces; expected a surface; read a point cloud by load_points()")

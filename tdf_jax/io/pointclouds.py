@@ -10,7 +10,7 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.sampling import drop_invalid as without_invalid, sample_surface
 from tdf_jax.io.arrays import read_npy, read_npz
 from tdf_jax.io.columns import read_columns
-from tdf_jax.io.content import check_spacing, existing_file, file_bytes, reading
+from tdf_jax.io.content import check_spacing, file_bytes, reading, supported_file
 from tdf_jax.io.meshes import MESH_SUFFIXES, joined_mesh, read_surface
 from tdf_jax.io.pcd import read_pcd
 
@@ -48,7 +48,7 @@ def load_points(
             are float32 numbers so far from the origin that these are more than 1 mm apart.
     """
     function = "load_points()"
-    path = existing_file(function, path, MESH_SUFFIXES + CLOUD_SUFFIXES, scale)
+    path = supported_file(function, path, MESH_SUFFIXES + CLOUD_SUFFIXES, scale)
     if count is not None:
         checks.count(function, "count", count)
     checks.seed(function, seed)

@@ -54,7 +54,7 @@ def confidence(residual: float, intercept: float = INTERCEPT, slope: float = SLO
     Raises:
         InputError: an argument is not one number, or the curve is not finite.
     """
-    residual = _number("confidence()", "residual", residual)
+    residual = checks.real("confidence()", "residual", residual)
     checks.number("confidence()", "intercept", intercept)
     checks.number("confidence()", "slope", slope)
     if not np.isfinite(residual):
@@ -219,16 +219,9 @@ def recognition(
         InputError: the residual or the logit is not one number, or the curve is not three finite numbers.
     """
     coefficients = checks.vector("recognition()", "curve", curve, unit="")
-    residual = _number("recognition()", "residual", residual)
-    surface_logit = _number("recognition()", "surface_logit", surface_logit)
+    residual = checks.real("recognition()", "residual", residual)
+    surface_logit = checks.real("recognition()", "surface_logit", surface_logit)
     if not np.isfinite([residual, surface_logit]).all():
         return None
     exponent = np.dot(coefficients, (1.0, -np.log(max(residual, 1e-9)), surface_logit))
     return float(1 / (1 + np.exp(-np.clip(exponent, -50, 50))))
-
-
-def _number(function: str, name: str, value: float) -> float:
-    """One number, which need not be finite."""
-    if np.ndim(value) != 0 or np.asarray(value).dtype.kind not in "fiu":
-        raise InputError(f"{function}: {name} is {value!r}; expected one number")
-    return float(value)
