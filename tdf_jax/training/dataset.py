@@ -26,7 +26,7 @@ from tdf_jax.geometry.winding import libigl
 from tdf_jax.io.mesh_folder import file_names, is_mesh, subfolder_hint, warn_of_subfolders
 from tdf_jax.io.meshes import MESH_SUFFIXES, file_axes
 from tdf_jax.shapes import FAMILIES
-from tdf_jax.training import workers as processes
+from tdf_jax.training import workers
 from tdf_jax.training.labels import UNIFORM_SHARE, Labelled, canonical_mesh, generated_object, scanned_object
 
 MANIFEST = "dataset.json"
@@ -365,7 +365,7 @@ def _mapped(function, tasks, count):
         yield map(function, tasks)
         return
     context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(count, context, processes.begin) as pool:
+    with concurrent.futures.ProcessPoolExecutor(count, context, workers.begin) as pool:
         try:
             yield pool.map(function, tasks)
         except concurrent.futures.process.BrokenProcessPool:

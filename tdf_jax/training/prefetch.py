@@ -19,7 +19,7 @@ from tdf_jax._internal import checks
 from tdf_jax._internal.devices import one_at_a_time
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import temporary_folder
-from tdf_jax.training import workers as processes
+from tdf_jax.training import workers
 from tdf_jax.training.batch import Batch
 from tdf_jax.training.dataset import DataSet
 
@@ -92,7 +92,7 @@ def _in_order(ask, start, count):
 def _open(folder, draw):
     """Prepare this process to draw batches."""
     global _draw
-    processes.begin(folder)
+    workers.begin(folder)
     columns = {
         field.name: np.asarray(np.load(folder / f"{field.name}.npy", mmap_mode="r"))
         for field in dataclasses.fields(DataSet)
