@@ -13,7 +13,7 @@ from tdf_jax.io.text import decode, numbers
 
 _COMMENTS = ("#", "//", "%", "!")
 MOST_COLUMNS = 20  # with a normal, a colour, an intensity and some features; a depth image has hundreds
-# x, "X", x [mm], x_mm, Points:0 and the like. What stands behind the axis is a unit.
+# x, "X", x [mm], x_mm, Points:0 and the like. What stands after the axis is a unit.
 _NAME = re.compile(
     r"(?:points?[_:. ]*|pos(?:ition)?[_:. ]*|coord[_:. ]*)?([xyz012])[\s_]*(?:[\[(/]?\s*([a-z]+)\s*[\])]?)?"
 )
@@ -77,17 +77,17 @@ def read_columns(data: bytes, scale: float = 1.0) -> Float[np.ndarray, "points 3
         for column in range(width if width <= MOST_COLUMNS else 0):
             try:
                 values[:, column] = _values(table, [column], rows)[:, 0]
-            except ValueError:  # behind the coordinates there may be words
+            except ValueError:  # after the coordinates there may be words
                 if column < 3:
                     raise
     return coordinate_columns(values)
 
 
 def coordinate_columns(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows 3"]:
-    """Take the coordinates from columns without names: the first three, or those behind a column that counts the rows.
+    """Take the coordinates from columns without names: the first three, or those after a column that counts the rows.
 
     Args:
-        values: numbers, (rows, columns). Colours, normals and the like behind the coordinates are left out, and so is
+        values: numbers, (rows, columns). Colours, normals and the like after the coordinates are left out, and so is
             a first column that has every number from 0 or 1 on once, in any order.
 
     Returns:
@@ -145,14 +145,14 @@ def _check_first(values):
 
 def _refuse_first(kind):
     raise UnsupportedError(
-        f"has a first column of {kind}, unlike those behind it, which may be numbers of the points, times or labels; "
-        f"expected x y z first; remove the first column, or all columns behind x y z, {_NAME_THEM}"
+        f"has a first column of {kind}, unlike those after it, which may be numbers of the points, times or labels; "
+        f"expected x y z first; remove the first column, or all columns after x y z, {_NAME_THEM}"
     )
 
 
 def _refuse_three(kind, what):
     raise UnsupportedError(
-        f"has first three columns of {kind}, unlike those behind them, which may be {what}; expected x y z first; "
+        f"has first three columns of {kind}, unlike those after them, which may be {what}; expected x y z first; "
         f"remove what is not x y z, {_NAME_THEM}"
     )
 
@@ -234,7 +234,7 @@ def _lines(text):
 
 
 def _without_count(rows):
-    """Lines without a first one that gives their number, and a title behind that."""
+    """Lines without a first one that gives their number, and a title after that."""
     if len(rows) < 2 or not re.fullmatch(r"\d+(\s+\d+)?", rows[0][1]):
         return rows
     count, *width = (int(word) for word in rows[0][1].split())
@@ -296,7 +296,7 @@ def _table(rows, delimiter, comma):
         if len(row) != width:
             raise UnsupportedError(
                 f"has {len(row)} columns in line {number}, and {width} in line {rows[0][0]}; expected one point x y z, "
-                "and the same numbers behind it, in each line"
+                "and the same numbers after it, in each line"
             )
     if comma and any(re.fullmatch(r"[+-]?\d*\.\d+", cell) for row in table for cell in row):
         raise UnsupportedError(_MIXED)
@@ -330,7 +330,7 @@ def _header(rows, delimiter, comma):
         if named_columns(names):
             return names
     if sum(map(_is_number, cells)) >= 3:
-        return None  # a point with a word behind it
+        return None  # a point with a word after it
     raise UnsupportedError(
         f"has the first line {rows[0][1][:80]!r}; expected numbers, or names of columns among which are x, y and z"
     )

@@ -84,7 +84,7 @@ def _container(data):
         size = int.from_bytes(data[start : start + 4], "little")
         kind, start = data[start + 4 : start + 8], start + 8
         if start + size > length:
-            raise ValueError(f"it is truncated: a chunk of {size} bytes ends behind the file")
+            raise ValueError(f"it is truncated: a chunk of {size} bytes ends after the end of the file")
         chunks.setdefault(kind, data[start : start + size])
         start += size
     if b"JSON" not in chunks:
@@ -251,8 +251,8 @@ class _Asset:
             raise ValueError(f"buffer view {view} has offsets, lengths or strides that are not possible")
         if start + length > len(data) or (count and offset + stride * (count - 1) + size > length):
             raise ValueError(
-                f"buffer view {view} ends behind the data, {len(data)} bytes in buffer {entry['buffer']}, or is "
-                f"shorter than the {count} rows of {size} bytes in it"
+                f"buffer view {view} ends after the end of the data, {len(data)} bytes in buffer {entry['buffer']}, or "
+                f"is shorter than the {count} rows of {size} bytes in it"
             )
         return (
             np.ndarray((count, width), kind, data, start + offset, (stride, kind.itemsize))

@@ -10,7 +10,7 @@ from tdf_jax.io.polygons import triangulate
 from tdf_jax.io.text import decode, indices, lines, numbers
 
 # Texture coordinates (ST), colours (C) and normals (N) follow the coordinates; 4 and n change what those are. The
-# counts may stand behind the keyword, even without a blank, as in the files of ModelNet.
+# counts may stand after the keyword, even without a blank, as in the files of ModelNet.
 _KEYWORD = re.compile(r"(ST)?(C)?(N)?(4)?(n)?OFF\b\s*|(ST)?(C)?(N)?OFF(?=\d)")
 
 

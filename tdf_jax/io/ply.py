@@ -84,7 +84,7 @@ def read_ply(data: bytes) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarr
 
 
 def _header(data):
-    """Byte order (empty for text), elements and the bytes behind the header."""
+    """Byte order (empty for text), elements and the bytes after the header."""
     if data[:2] in {b"\xff\xfe", b"\xfe\xff"} or data[:6] in {b"p\0l\0y\0", b"\0p\0l\0y"}:
         data = decode(data).encode()  # text in UTF-16; a binary file has a header of single bytes
     data = data.removeprefix(b"\xef\xbb\xbf")
@@ -125,7 +125,7 @@ def _add(element, name, kind, length):
 
 
 def _text_columns(element, wanted, rows, start):
-    """Of each wanted property, (values, lengths of lists), and the line behind the element."""
+    """Of each wanted property, (values, lengths of lists), and the line after the element."""
     stop = start + element.count
     if len(rows) < stop:
         raise ValueError(
@@ -160,7 +160,7 @@ def _text_columns(element, wanted, rows, start):
 
 
 def _binary_columns(element, wanted, body, start, order):
-    """Of each wanted property, (values, lengths of lists), and the byte behind the element."""
+    """Of each wanted property, (values, lengths of lists), and the byte after the element."""
     types = [np.dtype(order + kind) for kind in element.types]
     lengths = [np.dtype(order + kind) if kind else None for kind in element.lengths]
     if not any(element.lengths):
@@ -207,7 +207,7 @@ def _whole(element, values):
 
 
 def _length(element, kind, body, start):
-    """Length of the list that begins at a byte, and the byte behind the length."""
+    """Length of the list that begins at a byte, and the byte after the length."""
     stop = start + kind.itemsize
     _promised(element, stop, body)
     size = int.from_bytes(body[start:stop], "big" if kind.str[0] == ">" else "little", signed=kind.kind == "i")
@@ -244,5 +244,5 @@ def _promised(element, stop, body):
     if stop > len(body):
         raise ValueError(
             f"it is truncated: its header promises {element.count} rows of {element.name}, which need {stop} bytes "
-            f"behind the header, and it has {len(body)}"
+            f"after the header, and it has {len(body)}"
         )

@@ -30,7 +30,7 @@ def load_points(
         path: mesh (.obj, .stl, .ply, .glb, .gltf, .off, as `load_mesh` reads it), or cloud: one of these without
             faces, .pcd, .npy, .npz with the array `points` or a single array, or text with a point in each line (.xyz,
             .txt, .csv, .asc, .pts). Text and arrays have x y z in their first columns or in those of that name;
-            colours, normals and the like behind them are left out, and so is a column before them that counts the
+            colours, normals and the like after them are left out, and so is a column before them that counts the
             rows, in any order.
         count: number of points. A mesh is sampled by area, by default 1500 points. A larger cloud is reduced to a
             random subset in the order of the file, by default all points.

@@ -197,11 +197,11 @@ UNSUPPORTED = {
     ),
     "numbers from seven": (
         text(before=(lambda i: str(i + 7),)),
-        "a first column of whole numbers, unlike those behind it",
+        "a first column of whole numbers, unlike those after it",
     ),
     "numbers with gaps": (
         text(before=(lambda i: str(3 * i + 5),)),
-        "a first column of whole numbers, unlike those behind it",
+        "a first column of whole numbers, unlike those after it",
     ),
     "labels of one value": (text(",", before=("7",)), "a first column of whole numbers"),
     "numbers before two columns": (
@@ -234,7 +234,7 @@ UNSUPPORTED = {
         text(before=(lambda i: str(i % 4),), rows=[[f"{x * 1000:.0f}" for x in point] for point in CLOUD]),
         "a first column of few different numbers",
     ),
-    "times": (text(before=(lambda i: f"{i / 30:.3f}",)), "a first column of rising numbers, unlike those behind it"),
+    "times": (text(before=(lambda i: f"{i / 30:.3f}",)), "a first column of rising numbers, unlike those after it"),
     "commas of thousands": (text(rows=[["1,234.5", *row[1:]] for row in POINTS]), "commas as well as points"),
     "commas and points": (
         text(";", rows=[[row[0].replace(".", ","), *row[1:]] for row in POINTS]),

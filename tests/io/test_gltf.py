@@ -475,7 +475,7 @@ DAMAGED = {
     ),
     "view behind the buffer": (
         edited(lambda d, p: d["bufferViews"][1].update(byteLength=999)),
-        "buffer view 1 ends behind the data",
+        "buffer view 1 ends after the end of the data",
     ),
     "accessor behind the view": (
         edited(lambda d, p: d["accessors"][0].update(count=9)),
@@ -544,7 +544,7 @@ def test_damaged_containers_say_how(tmp_path):
         "truncated: its header promises": whole[:-7],
         "too long: its header promises": whole + b"more",
         "a header alone has 20": whole[:15],
-        "a chunk of .* bytes ends behind the file": whole[:12] + b"\xff\xff\xff\x0f" + whole[16:],
+        "a chunk of .* bytes ends after the end of the file": whole[:12] + b"\xff\xff\xff\x0f" + whole[16:],
         "has no chunk JSON": whole.replace(b"JSON", b"JUNK"),
         "is binary glTF of version 1; expected 2": older,
         "Expecting|utf-8|delimiter": whole.replace(b'"scene"', b'scene""'),
