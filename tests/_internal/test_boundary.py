@@ -231,7 +231,7 @@ def test_the_outermost_function_is_named():
         jax.jit(outer)(1.0)
 
 
-def test_a_missing_platform_is_told_apart_from_other_errors(monkeypatch):
+def test_a_missing_platform_is_distinguished_from_other_errors(monkeypatch):
     def failing():
         raise RuntimeError("Unable to initialize backend 'cuda'")
 

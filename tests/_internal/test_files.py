@@ -348,8 +348,8 @@ def test_a_pipe_or_device_is_written_to_and_stays(tmp_path):
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EINVAL])
-def test_a_disk_that_is_full_only_when_it_is_told_to_write(tmp_path, monkeypatch, number):
-    """As network file systems are; some others cannot be told to write."""
+def test_a_disk_that_says_that_it_is_full_only_when_it_must_write(tmp_path, monkeypatch, number):
+    """As network file systems do; some others do not support fsync."""
 
     def fails(file):
         raise OSError(number, os.strerror(number))

@@ -123,7 +123,7 @@ def test_the_page_tells_the_command_that_made_it(folder, weights):
 
 
 @pytest.mark.slow
-def test_the_methods_are_told_as_a_shell_takes_them(everything):
+def test_the_page_names_the_methods_as_a_shell_takes_them(everything):
     words = shlex.split(told(everything).split("`")[1])
     after = words[words.index("--methods") + 1 :]
     assert after[: [word.startswith("--") for word in [*after, "--"]].index(True)] == [
@@ -149,7 +149,7 @@ def test_run_again_it_computes_nothing_and_writes_the_same(folder, weights, monk
     assert (read(again)["tasks"], read(again)["rows"]) == (read(folder)["tasks"], read(folder)["rows"])
 
 
-def test_a_damaged_file_of_an_earlier_run_is_told(folder, weights, tmp_path, capsys):
+def test_a_damaged_file_of_an_earlier_run_is_named(folder, weights, tmp_path, capsys):
     shutil.copytree(folder, again := tmp_path / "again")
     for path in (again / "runs").iterdir():
         path.write_bytes(path.read_bytes()[:100])
@@ -319,7 +319,7 @@ def test_pictures_show_every_path_and_goals_where_there_are_enough_tasks(weights
         (("--meshes", "missing"), "there is no folder missing"),
     ],
 )
-def test_mistakes_are_told_before_anything_is_written(words, message, weights, tmp_path, monkeypatch, capsys):
+def test_mistakes_are_named_before_anything_is_written(words, message, weights, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("tdf_jax.evaluation.path_scores.run", lambda *_, **__: pytest.fail("the work has begun"))
     if words[0] == "--meshes":
@@ -333,7 +333,7 @@ def test_mistakes_are_told_before_anything_is_written(words, message, weights, t
 
 
 @pytest.mark.parametrize("place", ["file", "file/out"])
-def test_a_folder_that_cannot_be_made_is_told_before_the_work(place, weights, tmp_path, monkeypatch, capsys):
+def test_a_folder_that_cannot_be_made_is_named_before_the_work(place, weights, tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("mine")
     monkeypatch.setattr("tdf_jax.evaluation.path_scores.run", lambda *_, **__: pytest.fail("the work has begun"))
     with pytest.raises(SystemExit) as stop:
@@ -345,7 +345,7 @@ def test_a_folder_that_cannot_be_made_is_told_before_the_work(place, weights, tm
     assert tree(tmp_path) == {"file": b"mine"}
 
 
-def test_a_method_that_can_try_nothing_is_told(weights, real, tmp_path, capsys):
+def test_a_method_that_can_try_nothing_is_named(weights, real, tmp_path, capsys):
     """The oracle has no correspondences on a real mesh."""
     with pytest.raises(SystemExit) as stop:
         run(
@@ -461,7 +461,7 @@ def test_errors_are_drawn_as_shares_of_tasks():
         assert axes.get_xlim()[1] == 20
 
 
-def test_methods_are_told_apart_and_named_once():
+def test_methods_look_different_and_are_named_once():
     names = [f"method {index}" for index in range(14)]
     figure = errors_figure([made(0.01, 0.0, method=name) for name in names], "method 3")
     looks = {

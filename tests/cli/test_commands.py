@@ -736,7 +736,7 @@ def test_a_bug_keeps_its_traceback(monkeypatch, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_every_start_non_finite_is_told(refusal, weights, monkeypatch):
+def test_a_message_says_that_every_start_is_non_finite(refusal, weights, monkeypatch):
     def broken(*arguments, **options):
         return dataclasses.replace(tdf.imitate(*arguments, **options), energies=np.full(3, np.nan))
 

@@ -205,7 +205,7 @@ def test_the_path_is_as_sharp_as_asked_and_left_out_of_large_grids(sweep, monkey
     assert asked == [3.0]
 
 
-def test_missing_extras_are_told_before_any_work(weights, tmp_path, monkeypatch, capsys):
+def test_missing_extras_are_named_before_any_work(weights, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(command, "fill", None)
     for module, words in (("plotly.graph_objects", "plotly is not installed"), ("igl", "libigl")):
         with monkeypatch.context() as patch:
@@ -265,7 +265,7 @@ def test_a_demonstration_and_a_cloud_from_files(weights, tmp_path):
         (("--sharpness", "-1"), "--sharpness is -1"),
     ],
 )
-def test_mistakes_are_told_and_nothing_is_written(weights, tmp_path, capsys, words, message):
+def test_mistakes_are_named_and_nothing_is_written(weights, tmp_path, capsys, words, message):
     with pytest.raises(SystemExit) as stop:
         run("landscape", "--weights", weights, "--out", tmp_path / "out", "--no-plots", *QUICK, *words)
     assert stop.value.code == 2

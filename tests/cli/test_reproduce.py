@@ -236,7 +236,7 @@ def test_one_parameter_can_be_changed(weights, tmp_path):
         (("fig1", "--seed", "99999999999999999999"), "seed is 99999999999999999999"),
     ],
 )
-def test_mistakes_are_told(words, message, tmp_path, capsys):
+def test_mistakes_are_named(words, message, tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         main(["reproduce", *words, "--out", str(tmp_path / "out")])
     assert stop.value.code == 2
@@ -244,7 +244,7 @@ def test_mistakes_are_told(words, message, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_that_cannot_be_made_is_told(tmp_path, capsys):
+def test_a_folder_that_cannot_be_made_is_named(tmp_path, capsys):
     (tmp_path / "file").write_text("x")
     with pytest.raises(SystemExit) as stop:
         main(["reproduce", "fig1", "--out", str(tmp_path / "file" / "out")])

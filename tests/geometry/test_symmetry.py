@@ -36,7 +36,7 @@ def tips(T, size):
     return points @ T[:3, :3].T + T[:3, 3]
 
 
-def test_folds_are_those_that_are_told_apart():
+def test_folds_are_those_that_are_distinguished():
     assert ROUND == 0 and set(FOLDS) == {0, 1, 2, 4}
 
 

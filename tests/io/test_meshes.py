@@ -90,7 +90,7 @@ def test_inside_agrees_with_generated_mugs(index):
     assert inside(trimesh.Trimesh(mug.mesh.vertices, mug.mesh.faces[half], process=False), x) is None
 
 
-def test_a_missing_library_is_told(monkeypatch):
+def test_a_missing_library_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "igl", None)
     with pytest.raises(
         InputError, match=r"libigl is not installed; expected the extra 'mesh'; run: pip install 'tdf_jax\[mesh\]'"

@@ -221,7 +221,7 @@ def test_without_a_finite_start_the_result_says_so(monkeypatch, field, reference
     assert np.isnan(found.residual) and "non-finite" in found.status
 
 
-def test_imitate_carries_unless_told_otherwise(small_model, demonstration, reference, field, result):
+def test_imitate_carries_by_default(small_model, demonstration, reference, field, result):
     found = tdf.imitate(small_model, demonstration, random_cloud(3).astype(np.float32), key=KEY, config=CONFIG)
     np.testing.assert_array_equal(found.trajectories, result.trajectories)
     with pytest.raises(InputError, match="energy is given"):

@@ -327,7 +327,7 @@ def dying(task):
 
 
 @pytest.mark.slow
-def test_a_process_that_dies_is_told():
+def test_a_process_that_dies_is_named():
     with (
         pytest.raises(InputError, match="a process that labelled objects died.* Use fewer --workers"),
         dataset._mapped(dying, [1, 2, 3], 2) as rows,
@@ -524,7 +524,7 @@ def test_empty_folders_bad_meshes_and_mixed_units_are_refused_before_any_work(me
     assert not (tmp_path / "data").exists()
 
 
-def test_a_missing_library_is_told_once(meshes, tmp_path, monkeypatch):
+def test_a_missing_library_is_named_once(meshes, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "igl", None)
     with pytest.raises(InputError, match=r"^tdf dataset: libigl is not installed; expected the extra 'mesh'"):
         quiet_build(scanned_recipe(meshes), tmp_path / "data")

@@ -102,7 +102,7 @@ def test_training_lowers_the_loss(long):
     assert np.mean(losses[14:19]) < 0.8 * np.mean(losses[:4])
 
 
-def test_every_step_is_told_and_some_are_validated(whole):
+def test_every_step_is_recorded_and_some_are_validated(whole):
     folder, params = whole
     rows = metrics(folder)
     assert [row["step"] for row in rows] == list(range(1, 9))

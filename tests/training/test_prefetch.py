@@ -129,7 +129,7 @@ def test_a_killed_run_leaves_neither_processes_nor_files(data, folder, tmp_path)
 
 
 @pytest.mark.slow
-def test_a_process_that_dies_is_told(data):
+def test_a_process_that_dies_is_named(data):
     with prefetched(dying, data, 0, 2) as batches, pytest.raises(InputError, match="a process that drew samples died"):
         next(batches)
 
