@@ -65,10 +65,8 @@ class Grid:
                 raise InputError(
                     f"Grid(): the {name} axis goes from {steps[0]} to {steps[-1]}; expected it to increase"
                 )
-            if (
-                np.abs(steps - np.linspace(steps[0], steps[-1], len(steps))).max()
-                > EVEN_TOLERANCE * np.abs(steps).max()
-            ):
+            largest_error = np.abs(steps - np.linspace(steps[0], steps[-1], len(steps))).max()
+            if not largest_error <= EVEN_TOLERANCE * np.abs(steps).max():  # NaN too
                 raise InputError(f"Grid(): the steps of the {name} axis differ; expected even ones, as of np.linspace")
         axes = tuple(np.linspace(steps[0], steps[-1], len(steps)) for steps in axes)
         try:
