@@ -18,7 +18,7 @@ from tdf_jax.energy.reference import Reference, describe
 from tdf_jax.geometry.demonstration import Demonstration, check_apart
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.model import Model
-from tdf_jax.relation import carry_object, reference_of, target_field
+from tdf_jax.relation import Objects, carry_object, reference_of, target_field
 from tdf_jax.solvers.adam import OptimizeConfig, optimize
 from tdf_jax.solvers.initial import default_goal
 from tdf_jax.solvers.multistart import SolveConfig, solve
@@ -43,6 +43,7 @@ def imitate(
     goal: Float[Array | np.ndarray, "7"] | None = None,
     goal_offset: Float[Array | np.ndarray, "3"] | Sequence[float] | None = None,
     fix_last: bool = True,
+    seat: bool = True,
     energy: EnergyWeights | None = None,
     config: CarryConfig | SolveConfig | OptimizeConfig = CarryConfig(),
     progress: Callable | None = None,
@@ -70,6 +71,7 @@ def imitate(
         fix_last: keep the pose at the release at the goal. Otherwise, such as for the one pose of a grasp, the
             demonstration is carried rigidly with the pick; with the other configs all poses are free, and a goal is
             where the pose at the release starts.
+        seat: with a target, lower or raise the placed object until it touches the target; see `relate`.
         energy: weights of the terms of eq. 3, by default the paper's; only with a `config` that minimises it.
         config: settings of `carry`, of `solve`, or, for Adam as in the paper and for energies with eq. 6, of
             `optimize`.
@@ -96,6 +98,7 @@ def imitate(
             "config=SolveConfig() or OptimizeConfig() with it"
         )
     checks.boolean("imitate()", "fix_last", fix_last)
+    checks.boolean("imitate()", "seat", seat)
     reference = reference_of("imitate()", model, demonstration, target_points, target_model)
     if reference.contact is not None:
         given = {"goal": goal is not None, "goal_offset": goal_offset is not None, "fix_last=False": not fix_last}
@@ -107,11 +110,11 @@ def imitate(
             )
     field = encode(model, points)
     if reference.contact is not None:
-        target = target_field(model, target_points, target_model)
+        objects = Objects(points, target_points, field, target_field(model, target_points, target_model))
         if target_points is not None:
             check_apart("imitate()", points, target_points)
-        search = {"config": config, "progress": progress, "device_mesh": device_mesh}
-        return _judged(carry_object(field, target, reference, key, **search), model.info.name, field, points)
+        search = {"config": config, "seat": seat, "progress": progress, "device_mesh": device_mesh}
+        return _judged(carry_object(objects, reference, key, **search), model.info.name, field, points)
     goal = None if goal is None else jnp.asarray(checks.pose("imitate()", "goal", goal), float)
     if goal_offset is not None:
         goal = default_goal(field, reference) if goal is None else goal

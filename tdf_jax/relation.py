@@ -20,6 +20,7 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Contact, Reference, describe
 from tdf_jax.energy.residual import pick_residual
+from tdf_jax.energy.seating import touch_distance
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory, resample
@@ -37,7 +38,28 @@ from tdf_jax.uncertainty.modes import cluster_poses
 OBJECT_STREAM, TARGET_STREAM = 0x0B1EC7, 0x7A26E7
 SPACING = 0.01  # metres between poses to a target: with fewer poses the path would skip the demonstrated approach
 MAX_POSES = 200  # of a path that is made denser; one of more than 2 m has wider spacing, so that results stay small
+# Largest distance from touch in the demonstration, metres. Beyond it the object does not rest on the target, and is not
+# seated.
+MOST_TOUCH = 0.01
 MAX_SOLUTIONS = 25  # candidates of a result: distinct picks times distinct motions of the object
+
+
+@dataclasses.dataclass(frozen=True)
+class Objects:
+    """The new object and the new target.
+
+    Attributes:
+        points: cloud of the object in its initial pose, (points, 3), metres, world frame.
+        target_points: cloud of the target, (points, 3), metres, world frame; None if the demonstrated one has not
+            moved.
+        field: field of the object in its initial pose.
+        target: field of the target; None if it has not moved.
+    """
+
+    points: Float[Array | np.ndarray, "points 3"]
+    target_points: Float[Array | np.ndarray, "target_points 3"] | None
+    field: DescriptorField
+    target: DescriptorField | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,18 +70,22 @@ class Relations:
         target_contacts: poses X_t of the contact frame on the target, world frame, (solutions, 7).
         object_contacts: poses X_o of the contact frame on the object in its initial pose, world frame, (solutions, 7).
         energies: sum of the descriptor energies of both, (solutions,).
+        seatings: displacements of the object after both regions are brought together, so that it touches the target,
+            world frame, (solutions, 3), metres; zero where it is not seated.
         target_residual: residual of the best contact pose on the target; NaN if the target has not moved.
     """
 
     target_contacts: Float[np.ndarray, "solutions 7"]
     object_contacts: Float[np.ndarray, "solutions 7"]
     energies: Float[np.ndarray, " solutions"]
+    seatings: Float[np.ndarray, "solutions 3"]
     target_residual: float
 
     @property
     def motions(self) -> Float[Array, "solutions 7"]:
         """Motions M of the object: a point x of it in its initial pose ends at M x."""
-        return se3.compose(jnp.asarray(self.target_contacts), se3.inverse(jnp.asarray(self.object_contacts)))
+        together = se3.compose(jnp.asarray(self.target_contacts), se3.inverse(jnp.asarray(self.object_contacts)))
+        return together.at[:, 4:].add(jnp.asarray(self.seatings))
 
 
 @host
@@ -71,6 +97,7 @@ def relate(
     target_points: Float[Array | np.ndarray, "target_points 3"] | None = None,
     target_model: Model | None = None,
     key: PRNGKeyArray,
+    seat: bool = True,
     config: CarryConfig = CarryConfig(),
 ) -> Float[Array, "7"]:
     """Find the motion that places a new object on a new target as in a demonstration, without a pick.
@@ -84,6 +111,8 @@ def relate(
             has not moved.
         target_model: network of the target; by default `model`.
         key: random key; the result is a function of it.
+        seat: lower or raise the object by up to 1.5 cm until it touches the target, if the demonstrated object touched
+            its target from above; see `tdf_jax.energy.seating`.
         config: settings of the search on both objects.
 
     Returns:
@@ -95,10 +124,9 @@ def relate(
     """
     checks.key("relate()", key)
     reference = reference_of("relate()", model, demonstration, target_points, target_model)
-    found = find_relations(
-        "relate()", encode(model, points), target_field(model, target_points, target_model), reference, key, config
-    )
-    return found.motions[0]
+    checks.boolean("relate()", "seat", seat)
+    objects = Objects(points, target_points, encode(model, points), target_field(model, target_points, target_model))
+    return find_relations("relate()", objects, reference, key, config, seat).motions[0]
 
 
 def reference_of(function: str, model: Model, demonstration, target_points, target_model: Model | None) -> Reference:
@@ -152,21 +180,21 @@ def target_field(model: Model, target_points, target_model: Model | None) -> Des
 
 def find_relations(
     function: str,
-    field: DescriptorField,
-    target: DescriptorField | None,
+    objects: Objects,
     reference: Reference,
     key: PRNGKeyArray,
     config: CarryConfig,
+    seat: bool,
 ) -> Relations:
     """Find the contact region on both objects, and combine what was found.
 
     Args:
         function: name that the messages begin with.
-        field: field of the new object in its initial pose.
-        target: field of the new target; None if it has not moved.
+        objects: the new object and the new target.
         reference: the demonstration.
         key: random key.
         config: settings of the search.
+        seat: see `relate`.
 
     Returns:
         Every pair of a distinct pose on the target and one on the object, by the sum of their energies.
@@ -179,18 +207,19 @@ def find_relations(
         raise InputError(
             f"{function}: the demonstration has no target; expected Demonstration(target=tdf.Target(...)), or a goal"
         )
+    object_key, target_key = (jax.random.fold_in(key, stream) for stream in (OBJECT_STREAM, TARGET_STREAM))
     on_object, object_energies = _distinct(
         function,
         "object",
-        field,
+        objects.field,
         contact.object_descriptors,
         contact.T_object_contact,
         contact,
-        jax.random.fold_in(key, OBJECT_STREAM),
+        object_key,
         config,
     )
     residual = np.nan
-    if target is None:
+    if objects.target is None:
         on_target, target_energies = np.asarray(contact.T_world_contact)[None], np.zeros(1, object_energies.dtype)
     else:
         if contact.target_descriptors is None or contact.T_target_contact is None:
@@ -198,17 +227,35 @@ def find_relations(
         on_target, target_energies = _distinct(
             function,
             "target",
-            target,
+            objects.target,
             contact.target_descriptors,
             contact.T_target_contact,
             contact,
-            jax.random.fold_in(key, TARGET_STREAM),
+            target_key,
             config,
         )
         residual = pick_residual(float(target_energies[0]), contact.target_descriptors)
     energies = target_energies[:, None] + object_energies
-    rows, columns = np.unravel_index(np.argsort(energies, axis=None, kind="stable"), energies.shape)
-    return Relations(on_target[rows], on_object[columns], energies[rows, columns], residual)
+    order = np.argsort(energies, axis=None, kind="stable")[:MAX_SOLUTIONS]
+    rows, columns = np.unravel_index(order, energies.shape)
+    found = Relations(
+        on_target[rows], on_object[columns], energies[rows, columns], np.zeros((len(rows), 3), np.float32), residual
+    )
+    return dataclasses.replace(found, seatings=_seatings(objects, found, contact)) if seat else found
+
+
+def _seatings(objects: Objects, found: Relations, contact: Contact) -> Float[np.ndarray, "solutions 3"]:
+    """Displacements of the placed object until it touches the target; zero where it does not."""
+    if not abs(float(contact.touch)) <= MOST_TOUCH:  # also where it is not known
+        return found.seatings
+    target_points = contact.target_points if objects.target_points is None else objects.target_points
+    rotations = se3.rotation(jnp.asarray(found.target_contacts))
+    directions = np.asarray(rotations @ contact.down, float)
+    distances = [
+        touch_distance(objects.field, objects.target, objects.points, target_points, motion, direction)
+        for motion, direction in zip(found.motions, directions, strict=True)
+    ]
+    return (np.nan_to_num(distances)[:, None] * directions).astype(np.float32)
 
 
 def _distinct(function, what, field, descriptors, T_origin_contact, contact: Contact, key, config: CarryConfig):
@@ -222,11 +269,11 @@ def _distinct(function, what, field, descriptors, T_origin_contact, contact: Con
 
 
 def carry_object(
-    field: DescriptorField,
-    target: DescriptorField | None,
+    objects: Objects,
     reference: Reference,
     key: PRNGKeyArray,
     *,
+    seat: bool = True,
     config: CarryConfig = CarryConfig(),
     progress: Callable[[int, Float[np.ndarray, " candidates"]], None] | None = None,
     device_mesh: jax.sharding.Mesh | None = None,
@@ -236,10 +283,10 @@ def carry_object(
     The pose at the release is M times the pick in every candidate, so that a change of the pick changes it.
 
     Args:
-        field: field of the new object in its initial pose.
-        target: field of the new target; None if it has not moved.
+        objects: the new object and the new target.
         reference: a demonstration with a target.
         key: random key; the pick is that of `carry` with the same key.
+        seat: see `relate`.
         config: settings of the search for the pick and for the contact region.
         progress: see `solve`; of the pick.
         device_mesh: see `solve`; for the pick.
@@ -250,9 +297,9 @@ def carry_object(
     Raises:
         InputError: as for `solve`, or the demonstration has no target.
     """
-    relations = find_relations("imitate()", field, target, reference, key, config)
+    relations = find_relations("imitate()", objects, reference, key, config, seat)
     plain = dataclasses.replace(reference, approach=reference.approach[:0], retreat=reference.retreat[:0])
-    picked = carry(field, plain, key, fix_last=False, config=config, progress=progress, device_mesh=device_mesh)
+    picked = carry(objects.field, plain, key, fix_last=False, config=config, progress=progress, device_mesh=device_mesh)
     picks, motions = np.asarray(picked.picks), np.asarray(relations.motions)
     joint = np.where(np.asarray(picked.finite), np.asarray(picked.energies), np.inf)[:, None] + relations.energies
     order = np.argsort(joint, axis=None, kind="stable")[:MAX_SOLUTIONS]

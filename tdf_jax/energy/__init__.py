@@ -5,4 +5,5 @@ Modules:
     losses: eq. 2, 3 and 6: the energy of one trajectory
     reference: descriptors and poses to match
     residual: normalised energy of a pick
+    seating: how far a placed object is from touching its target
 """

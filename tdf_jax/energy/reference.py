@@ -13,6 +13,8 @@ from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import public
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.descriptors import trajectory_descriptor
+from tdf_jax.energy.seating import touch_distance
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.networks.encoding import encode
@@ -30,6 +32,9 @@ COMBINATIONS = ("mean", "median")
         "T_object_contact",
         "T_target_contact",
         "T_world_contact",
+        "target_points",
+        "down",
+        "touch",
     ],
     meta_fields=[],
 )
@@ -46,6 +51,11 @@ class Contact:
             cloud, axes of the world, `wxyz_xyz`, (7,).
         T_target_contact: pose of the contact frame relative to the centroid of the target's cloud, (7,).
         T_world_contact: pose of the contact frame at the release, world frame, (7,).
+        target_points: cloud of the demonstrated target, world frame, (target_points, 3).
+        down: unit vector down (world -z) at the release, contact frame, (3,).
+        touch: how far down the demonstrated object touches its target from its pose at the release, metres, see
+            `tdf_jax.energy.seating`; the median of several demonstrations. NaN if it does not touch from above, or is
+            not known.
     """
 
     query: Float[Array, "queries 3"]
@@ -54,6 +64,9 @@ class Contact:
     T_object_contact: Float[Array, "7"]
     T_target_contact: Float[Array, "7"] | None
     T_world_contact: Float[Array, "7"]
+    target_points: Float[Array, "target_points 3"]
+    down: Float[Array, "3"]
+    touch: Float[Array, ""]
 
 
 def _no_poses() -> Array:
@@ -156,6 +169,7 @@ def _contact(demonstrations, fields, target_model, combine) -> Contact | None:
     ]
     on_object = _relative(demonstrations[0].T_object_contact[None], fields[0].origin)[0]
     described = on_target = None
+    target_fields = [None] * len(targets)
     if target_model is not None:
         target_fields = [encode(target_model, target.points) for target in targets]
         described = _combined(
@@ -166,13 +180,33 @@ def _contact(demonstrations, fields, target_model, combine) -> Contact | None:
             combine,
         )
         on_target = _relative(np.asarray(first.T_world_contact)[None], target_fields[0].origin)[0]
+    T_world_contact = jnp.asarray(first.T_world_contact, on_object.dtype)
     return Contact(
         query,
         _combined(seen, combine),
         described,
         on_object,
         on_target,
-        jnp.asarray(first.T_world_contact, on_object.dtype),
+        T_world_contact,
+        jnp.asarray(first.points, on_object.dtype),
+        -se3.rotation(T_world_contact)[2],
+        jnp.asarray(_touch(demonstrations, fields, target_fields), on_object.dtype),
+    )
+
+
+def _touch(demonstrations, fields, target_fields) -> float:
+    """How far down the demonstrated objects touch their targets, the median; NaN if one does not, or is traced."""
+    scenes = list(zip(demonstrations, fields, target_fields, strict=True))
+    if any(checks.traced(*jax.tree.leaves((demo.points, demo.target.points, field))) for demo, field, _ in scenes):
+        return np.nan
+    down = np.array([0.0, 0.0, -1.0])
+    return float(
+        np.median(
+            [
+                touch_distance(field, target, demo.points, demo.target.points, demo.object_motion, down)
+                for demo, field, target in scenes
+            ]
+        )
     )
 
 

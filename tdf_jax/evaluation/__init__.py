@@ -21,6 +21,8 @@ Modules:
     places: measured places of a mug
     recognition_study: recognition of objects of another category
     records: header of JSON records
+    relation_success: gap, penetration, orientation and support of a placed object
+    relation_tasks: an object and a target that fit, the true placement, a demonstration
     scene: a demonstration and a target in one world
     statistics: success thresholds and bootstrap intervals
     tables: tables as Markdown and as text

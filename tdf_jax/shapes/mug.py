@@ -97,6 +97,14 @@ class Mug(Shape):
         """Pose with its origin on the axis in the plane of the base, x towards the handle, z up."""
         return self.frames["base"]
 
+    @property
+    def finger_hole(self) -> Float[np.ndarray, "corners 2"]:
+        """Outline around the finger hole in the x-z plane, (corners, 2), metres, object frame.
+
+        It is the handle's centre line, and the line through the wall that closes it.
+        """
+        return _centre_line(self.parameters)
+
     @staticmethod
     def solid_of(parameters: MugParameters) -> Solid:
         """The body and the handle, the cavity and the recess of the foot."""

@@ -1,0 +1,94 @@
+"""Seating: how far an object is lowered or raised until it touches its target, by the occupancies of both."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from tdf_jax.geometry import se3
+from tdf_jax.networks.field import DescriptorField
+
+REACH = 0.015  # metres; an object that touches nothing within it is not moved
+STEPS = 15  # tested displacements each way; between them the occupancy is interpolated
+OCCUPIED = 0.5  # occupancy that counts as touching
+RANK = 3  # the touch is that of the third point, so that one wrong value does not decide
+BESIDE = 0.01  # metres across the direction within which a point may meet the other object
+POINTS = 256  # points of each object that are tested
+
+
+def touch_distance(
+    field: DescriptorField,
+    target: DescriptorField | None,
+    points: Float[Array | np.ndarray, "points 3"],
+    target_points: Float[Array | np.ndarray, "target_points 3"],
+    motion: Float[Array | np.ndarray, "7"],
+    direction: Float[Array | np.ndarray, "3"],
+) -> float:
+    """How far along a direction a placed object touches its target.
+
+    The object and the target touch where points of the cloud of one have an occupancy of a half in the field of the
+    other.
+
+    Args:
+        field: field of the object in its initial pose.
+        target: field of the target; None to test the target's points in the object's field only.
+        points: cloud of the object in its initial pose, (points, 3), metres, world frame.
+        target_points: cloud of the target, (target_points, 3), metres, world frame.
+        motion: motion of the object to the target, `wxyz_xyz`, (7,), metres.
+        direction: unit vector along which the object is moved, such as down, (3,), world frame.
+
+    Returns:
+        The displacement, metres: positive along the direction if there is a gap, negative if the two overlap; NaN if
+            they do not touch, or overlap still, within `REACH`.
+    """
+    motion, direction = jnp.asarray(motion, jnp.float32), np.asarray(direction, float)
+    placed = np.asarray(se3.transform(motion, jnp.asarray(points, jnp.float32)), float)
+    near, target_near = _meeting(placed, np.asarray(target_points, float), direction)
+    if not len(near):
+        return np.nan
+    steps = np.linspace(-REACH, REACH, 2 * STEPS + 1)
+    shifts = steps[:, None, None] * direction
+    back = se3.transform(se3.inverse(motion), jnp.asarray(target_near - shifts, jnp.float32).reshape(-1, 3))
+    occupied = [_highest(field, back, len(steps), len(target_near))]
+    if target is not None:
+        moved = jnp.asarray(near + shifts, jnp.float32).reshape(-1, 3)
+        occupied.append(_highest(target, moved, len(steps), len(near)))
+    return _first_touch(steps, np.max(occupied, axis=0))
+
+
+def _meeting(points, target_points, direction) -> tuple[np.ndarray, np.ndarray]:
+    """Points of either cloud that may meet the other along a direction, at most `POINTS` of each."""
+    from scipy.spatial import KDTree
+
+    across = np.linalg.svd(direction[None])[2][1:].T
+    pairs = KDTree(points @ across).sparse_distance_matrix(
+        KDTree(target_points @ across), BESIDE, output_type="coo_matrix"
+    )
+    gaps = target_points[pairs.col] @ direction - points[pairs.row] @ direction
+    meets = np.abs(gaps) < 2 * REACH
+    chosen = (np.unique(index[meets]) for index in (pairs.row, pairs.col))
+    mine, other = (index[np.linspace(0, len(index) - 1, min(POINTS, len(index))).astype(int)] for index in chosen)
+    return points[mine], target_points[other]
+
+
+def _highest(field: DescriptorField, x: Float[Array, "all 3"], steps: int, count: int) -> np.ndarray:
+    """The occupancy of the `RANK`-th point at every displacement, (steps,)."""
+    padded = -(-count // 64) * 64  # few shapes, so that few programs are compiled
+    filled = jnp.zeros((steps, padded, 3), x.dtype).at[:, :count].set(x.reshape(steps, count, 3))
+    occupancy = np.asarray(field.occupancy(filled.reshape(-1, 3))).reshape(steps, padded)[:, :count]
+    return np.sort(occupancy, axis=1)[:, -min(RANK, count)]
+
+
+def _first_touch(steps: np.ndarray, occupied: np.ndarray) -> float:
+    """Where the occupancy crosses a half: on the way down if the middle is free, on the way up if it is not."""
+    middle = len(steps) // 2
+    touches = occupied > OCCUPIED
+    if touches[middle]:
+        free = np.flatnonzero(~touches[:middle])
+        low = free[-1] if len(free) else None
+    else:
+        hit = np.flatnonzero(touches[middle:])
+        low = middle + hit[0] - 1 if len(hit) else None
+    if low is None:
+        return np.nan
+    share = (OCCUPIED - occupied[low]) / (occupied[low + 1] - occupied[low])
+    return float(steps[low] + share * (steps[low + 1] - steps[low]))

@@ -1,0 +1,62 @@
+"""Seating on solids whose touch is known."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tdf_jax.energy.seating import REACH, touch_distance
+
+RADIUS = 0.04
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+def solid(depth):
+    """A field whose occupancy rises through a half where a depth function is zero."""
+    return SimpleNamespace(occupancy=lambda x: jax.nn.sigmoid(2000 * depth(jnp.asarray(x))))
+
+
+def sphere(count=4000, seed=0):
+    points = np.random.default_rng(seed).normal(size=(count, 3))
+    return RADIUS * points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def floor(count=4000, seed=1):
+    """A floor at z = 0, as a cloud."""
+    return np.random.default_rng(seed).uniform(-0.08, 0.08, (count, 3)) * [1, 1, 0]
+
+
+BALL = solid(lambda x: RADIUS - jnp.linalg.norm(x, axis=-1))
+FLOOR = solid(lambda x: -x[..., 2])
+
+
+def raised(height, motion=(1.0, 0, 0, 0, 0, 0, 0)):
+    return np.array(motion) + [0, 0, 0, 0, 0, 0, RADIUS + height]
+
+
+@pytest.mark.parametrize("height", [0.012, 0.004, 0.0, -0.003, -0.011])
+@pytest.mark.parametrize("target", [FLOOR, None], ids=["both fields", "the object's alone"])
+def test_a_ball_is_lowered_or_raised_onto_the_floor(height, target):
+    found = touch_distance(BALL, target, sphere(), floor(), raised(height), DOWN)
+    assert abs(found - height) < 1e-3
+
+
+def test_the_touch_turns_with_the_scene():
+    """The object lies turned, and the floor is a wall."""
+    quarter = np.array([np.sqrt(0.5), np.sqrt(0.5), 0, 0, 0, 0, 0])  # z becomes -y
+    wall = solid(lambda x: x[..., 1])
+    motion = quarter + [0, 0, 0, 0, 0, -RADIUS - 0.006, 0]
+    found = touch_distance(BALL, wall, sphere(), floor() @ [[1, 0, 0], [0, 0, 1], [0, -1, 0]], motion, [0.0, 1.0, 0.0])
+    assert abs(found - 0.006) < 1e-3
+
+
+@pytest.mark.parametrize("height", [REACH + 0.003, -REACH - 0.003])
+def test_what_does_not_touch_within_reach_is_not_seated(height):
+    assert np.isnan(touch_distance(BALL, FLOOR, sphere(), floor(), raised(height), DOWN))
+
+
+def test_what_is_beside_the_target_does_not_touch_it():
+    aside = raised(0.004) + [0, 0, 0, 0, 0.3, 0, 0]
+    assert np.isnan(touch_distance(BALL, FLOOR, sphere(), floor(), aside, DOWN))
