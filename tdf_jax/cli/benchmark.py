@@ -8,9 +8,13 @@ from typing import Annotated, Literal
 import tyro
 
 _NONE = "(default: none)"
+_CATEGORY = "(default: those of the category)"
 PAGE, RECORD, RUNS = "benchmark.md", "benchmark.json", "runs"
+RELATIONS_PAGE, RELATIONS_RECORD = "relations.md", "relations.json"
+Task = Literal["bowl_on_mug", "mug_on_rack", "bottle_in_container"]
+Pose = Literal["upright", "tilt60", "uniform"]
 Cloud = Literal[
-    "full", "views1", "views2", "views4", "points300", "points1000", "points3000", "noise", "half", "double"
+    "full", "views1", "views2", "views3", "views4", "points300", "points1000", "points3000", "noise", "half", "double"
 ]
 
 
@@ -26,12 +30,18 @@ def benchmark(
     recursive: bool = False,
     num_poses: int = 6,
     demonstrations: Annotated[tuple[int, ...], tyro.conf.arg(metavar="INT", help_behavior_hint=_NONE)] = (),
+    relations: bool = False,
+    tasks: tuple[Task, ...] = ("bowl_on_mug", "mug_on_rack", "bottle_in_container"),
+    pose: tuple[Pose, ...] = ("upright", "tilt60", "uniform"),
+    object_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
+    target_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("benchmark"),
 ) -> None:
     """Imitate whole trajectories on unseen mugs, and measure every method against the ground truth.
 
-    Writes benchmark.md, benchmark.json and pictures. A run that was interrupted, or that is repeated with more pairs,
-    clouds or methods, computes only what is missing.
+    With --relations, place objects on unseen targets instead, and judge the placements. Writes benchmark.md,
+    benchmark.json and pictures, or relations.md and relations.json. A run that was interrupted, or that is repeated
+    with more pairs, clouds or methods, computes only what is missing.
 
     Args:
         weights: a name of shipped weights, or a .safetensors file.
@@ -45,7 +55,15 @@ def benchmark(
         meshes: folder of real mugs with a meshes.json; see docs/guide/evaluation.md.
         recursive: use the meshes in subfolders of that folder too.
         num_poses: number of random poses of each real mug.
-        demonstrations: numbers of demonstrations, such as 1 3 5 10, for picks from several demonstrations.
+        demonstrations: numbers of demonstrations, such as 1 3 5 10, for picks from several demonstrations; with
+            --relations 1 (by default), 10, or both.
+        relations: place one object on another, as in Relational NDF; of the options above, only --pairs, --seed,
+            --clouds, --methods and --demonstrations apply.
+        tasks: tasks of --relations.
+        pose: poses of both objects of --relations: upright with a random yaw, with roll and pitch within 60 degrees
+            too, or uniform.
+        object_weights: weights of the object of --relations.
+        target_weights: weights of the target of --relations.
         out: folder for the page; its folder runs keeps the computed attempts.
     """
     from tdf_jax._internal.errors import InputError
@@ -59,6 +77,13 @@ def benchmark(
     from tdf_jax.geometry.winding import libigl
     from tdf_jax.networks.checkpoint import load_model
 
+    if relations:
+        settings = {
+            "pairs": pairs, "seed": seed, "clouds": clouds, "methods": methods,
+            "demonstrations": demonstrations or (1,), "tasks": tasks, "pose": pose, "object_weights": object_weights,
+            "target_weights": target_weights,
+        }  # fmt: skip
+        return _relations(out, settings)
     _check(pairs, seed, height, clouds, methods, num_starts, meshes, num_poses, demonstrations)
     names = list(METHODS) if "all" in methods else [name for name in METHODS if name in methods]
     if meshes is not None:
@@ -97,6 +122,69 @@ def benchmark(
     replace_file("tdf benchmark", out / PAGE, page(scores, model, settings, extras).encode())
     print(out / PAGE)
     _draw(out, makers, scores, extras)
+
+
+def _relations(out: Path, settings: dict) -> None:
+    """`tdf benchmark --relations`."""
+    from tdf_jax._internal import checks
+    from tdf_jax._internal.errors import InputError
+    from tdf_jax._internal.files import replace_file
+    from tdf_jax.evaluation.conditions import SCALES
+    from tdf_jax.evaluation.records import write_record
+    from tdf_jax.evaluation.relation_report import page, record
+    from tdf_jax.evaluation.relation_scores import DEMONSTRATIONS, METHODS, Condition, Networks, run
+    from tdf_jax.evaluation.relation_tasks import RELATIONS, draw_pair
+    from tdf_jax.geometry.winding import libigl
+    from tdf_jax.networks.checkpoint import load_model
+
+    checks.count("tdf benchmark", "--pairs", settings["pairs"])
+    checks.seed("tdf benchmark", settings["seed"], "--seed")
+    names = list(METHODS) if "all" in settings["methods"] else settings["methods"]
+    for name in names:
+        checks.choice("tdf benchmark", "--methods", name, METHODS)
+    for flag in ("methods", "clouds", "tasks", "pose"):
+        if not settings[flag]:
+            raise InputError(f"tdf benchmark: --{flag} is empty; expected at least one")
+    for condition in settings["clouds"]:
+        if condition in SCALES:
+            raise InputError(
+                f"tdf benchmark: --clouds is {condition!r}; expected no condition of size with --relations, whose "
+                "objects have their natural size"
+            )
+    for count in settings["demonstrations"]:
+        checks.choice("tdf benchmark", "--demonstrations", count, (1, DEMONSTRATIONS))
+    for flag, side in (("object_weights", "object"), ("target_weights", "target")):
+        sides = sorted({getattr(RELATIONS[task], side) for task in settings["tasks"]})
+        if settings[flag] is not None and len(sides) > 1:
+            raise InputError(
+                f"tdf benchmark: --{flag.replace('_', '-')} is given, and --tasks need weights of {', '.join(sides)}; "
+                "expected tasks of one category there"
+            )
+    libigl("tdf benchmark --relations")
+    load = functools.cache(load_model)
+    networks = {
+        task: Networks(
+            load(settings["object_weights"] or RELATIONS[task].object),
+            load(settings["target_weights"] or RELATIONS[task].target),
+        )
+        for task in dict.fromkeys(settings["tasks"])
+    }
+    conditions = [
+        Condition(task, poses, clouds, count)
+        for task in dict.fromkeys(settings["tasks"])
+        for clouds in dict.fromkeys(settings["clouds"])
+        for poses in dict.fromkeys(settings["pose"])
+        for count in dict.fromkeys(settings["demonstrations"])
+    ]
+    folder = _folder(out, RELATIONS_PAGE, RELATIONS_RECORD)
+    scores = list(run(conditions, networks, names, folder, pairs=settings["pairs"], seed=settings["seed"]))
+    redrawn = {
+        task: sum(draw_pair(task, settings["seed"], number).redrawn for number in range(settings["pairs"]))
+        for task in dict.fromkeys(settings["tasks"])
+    }
+    write_record("tdf benchmark", out / RELATIONS_RECORD, record(scores, networks, settings, redrawn), indent=None)
+    replace_file("tdf benchmark", out / RELATIONS_PAGE, page(scores, settings, redrawn).encode())
+    print(out / RELATIONS_PAGE)
 
 
 def _makers(pairs, seed, height, clouds, targets, num_poses) -> list[Callable]:
@@ -150,13 +238,13 @@ def _draw(out, makers, scores, extras) -> None:
     pictures.check()
 
 
-def _folder(out: Path) -> Path:
+def _folder(out: Path, page: str = PAGE, record: str = RECORD) -> Path:
     """The folder of computed attempts, made at the start: an error at the end would lose an hour of work."""
     from tdf_jax._internal.errors import InputError
 
-    if (out / PAGE).exists() and not (out / RECORD).exists():
+    if (out / page).exists() and not (out / record).exists():
         raise InputError(
-            f"tdf benchmark: {out / PAGE} is not of an earlier benchmark, there is no {RECORD} beside it; expected "
+            f"tdf benchmark: {out / page} is not of an earlier benchmark, there is no {record} beside it; expected "
             "another --out: nothing of yours is overwritten"
         )
     try:

@@ -11,7 +11,7 @@ from tdf_jax.geometry.views import cameras, visible
 if TYPE_CHECKING:
     import trimesh
 
-VIEWS = {"views1": 1, "views2": 2, "views4": 4}
+VIEWS = {"views1": 1, "views2": 2, "views3": 3, "views4": 4}
 SPARSE = {"points300": 300, "points1000": 1000, "points3000": 3000, "noise": 300}
 SCALES = {"half": 0.5, "double": 2.0}
 CONDITIONS = ("full", *VIEWS, *SPARSE, *SCALES)
