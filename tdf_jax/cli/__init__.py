@@ -5,4 +5,5 @@ Modules:
     options: options that commands share
     pictures: optional outputs, which may fail
     streams: standard output and error, which may fail
+    tasks: generated objects and targets
 """

@@ -1,4 +1,4 @@
-"""`tdf imitate`: the main job, from files or a pair of generated mugs to a folder of results."""
+"""`tdf imitate`: the main job, from files or generated objects to a folder of results."""
 
 import contextlib
 import dataclasses
@@ -19,11 +19,11 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file, replace_folder
 from tdf_jax.cli.options import Settings, make_scene, resolved
 from tdf_jax.cli.pictures import Pictures
+from tdf_jax.cli.tasks import TaskScene, make_task, not_judged
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import describe
 from tdf_jax.evaluation.metrics import path_error, pose_error
 from tdf_jax.evaluation.scene import Scene
-from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.imitation import DOUBT, imitate as imitate_scene
 from tdf_jax.io.pointclouds import load_points
@@ -68,13 +68,18 @@ def _run(settings: Settings, folder: Path, pictures: Pictures) -> dict:
         if not isinstance(config, CarryConfig):
             energy = EnergyWeights() if settings.k is None else EnergyWeights(settings.k)
         model = load_model(str(settings.weights))  # `resolved` has put the name of the category's weights
-        scene = make_scene(settings, query_key)
         target_model, target_points = _target(settings, model)
+        task = None if settings.task is None else make_task(settings)
+        scene = make_scene(settings, query_key) if task is None else task.scene
+        target_points = target_points if task is None else task.target_points
         related = scene.demonstration.target is not None
         offset = None if related and not any(settings.goal_offset) else settings.goal_offset
     with _timed(seconds, "encode"):
         reference = jax.block_until_ready(describe(model, scene.demonstration, target_model=target_model))
-    with _timed(seconds, "optimise"), _progress(config.num_steps) as progress:
+    steps = config.solver.num_steps if isinstance(config, CarryConfig) else config.num_steps
+    # The regions on the object and on a new target are found before the pick, and report no steps.
+    before = 0 if not related else 1 if target_points is None else 2
+    with _timed(seconds, "optimise"), _progress(steps, before) as progress:
         result = imitate_scene(
             model,
             reference,
@@ -88,20 +93,23 @@ def _run(settings: Settings, folder: Path, pictures: Pictures) -> dict:
             progress=progress,
         )
         trajectory = jax.block_until_ready(result.trajectory)
+    relation = _relation(scene, task, result)
     save_trajectory(folder / "trajectory.npz", trajectory)
     save_trajectory(folder / "trajectory.tum", trajectory)
     if not settings.no_plots:
         with _timed(seconds, "plots"):
             rows = "start" if isinstance(config, OptimizeConfig) else "candidate"
-            _draw(folder, scene, target_points, result, rows, pictures)
+            _draw(folder, scene, target_points, result, rows, relation, pictures)
     seconds["total"] = time.perf_counter() - began
-    record = _record(settings, model, scene, energy, config, result, seconds)
+    record = _record(settings, model, scene, energy, config, result, relation, seconds)
     replace_file("tdf imitate", folder / RESULT, json.dumps(record, indent=1).encode())
     return record
 
 
 def _target(settings: Settings, model: Model) -> tuple[Model | None, np.ndarray | None]:
-    """Network and points of the new target; None where there is none."""
+    """Network and points of the new target; None where there is none. `make_task` has the points of a task."""
+    if settings.task is not None:
+        return None if settings.target_weights is None else load_model(settings.target_weights), None
     if settings.target_object is None:
         return None, None
     points = load_points(
@@ -130,28 +138,35 @@ def _config(settings: Settings) -> CarryConfig | SolveConfig | OptimizeConfig:
 
 
 def _draw(
-    folder: Path, scene: Scene, target_points: np.ndarray | None, result: Result, rows: str, pictures: Pictures
+    folder: Path,
+    scene: Scene,
+    target_points: np.ndarray | None,
+    result: Result,
+    rows: str,
+    relation: dict | None,
+    pictures: Pictures,
 ) -> None:
     with pictures.drawing(folder / "imitation.png") as path:
         from tdf_jax.viz.imitation import imitation_figure
+        from tdf_jax.viz.relations import relation_figure
         from tdf_jax.viz.style import save_figure
 
-        trajectory = result.trajectory
-        expected = scene.expected(trajectory.wxyz_xyz[-1], trajectory.wxyz_xyz[0])
-        title = _title(float(result.loss), _errors(trajectory, expected))
-        demonstration, points, meshes = scene.demonstration, scene.points, scene.meshes
-        if demonstration.target is not None:
-            # One cloud of both objects each; a demonstrated target that stands where it stood is on both sides.
-            stands = demonstration.target.points if target_points is None else target_points
-            points, meshes = np.concatenate([points, stands]), (None, None)
-            both = np.concatenate([demonstration.points, demonstration.target.points])
-            demonstration = Demonstration(both, demonstration.trajectory, demonstration.query)
-        save_figure(path, imitation_figure(demonstration, points, trajectory, expected, meshes, title))
+        found, expected = _errors(scene, result.trajectory)
+        title = _title(float(result.loss), found, relation)
+        if relation is None:
+            figure = imitation_figure(
+                scene.demonstration, scene.points, result.trajectory, expected, scene.meshes, title
+            )
+        else:
+            figure = relation_figure(scene.demonstration, scene.points, result, target_points, title=title)
+        save_figure(path, figure)
     with pictures.drawing(folder / "loss.png") as path:
         from tdf_jax.viz.imitation import loss_figure
         from tdf_jax.viz.style import save_figure
 
-        history = np.column_stack([result.candidate_history, result.energies])
+        history = np.asarray(result.candidate_history)
+        if relation is None:  # with a target, the last energies are sums with those of the contact regions
+            history = np.column_stack([history, result.energies])
         save_figure(path, loss_figure(history, int(result.best), rows=rows))
 
 
@@ -163,36 +178,56 @@ def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _progress(iterations: int) -> Iterator:
-    """A bar on stderr, and the function that `optimize` calls to move it."""
-    with tqdm(total=iterations, desc="imitating", unit="step") as bar:
+def _progress(iterations: int, before: int = 0) -> Iterator:
+    """A bar on stderr, and the function that solvers call to move it; `before` solves end before the first call."""
+    with tqdm(total=(before + 1) * iterations, desc="imitating", unit="step") as bar:
 
         def move(done, energies):
             bar.set_postfix(loss=f"{np.min(energies):.5f}", refresh=False)
-            bar.update(done - bar.n)
+            bar.update(before * iterations + done - bar.n)
 
         yield move
 
 
-def _errors(trajectory: Trajectory, expected: Trajectory | None) -> dict | None:
-    """Distances from the truth, metres and radians; None where it is not known."""
+def _errors(scene: Scene, trajectory: Trajectory) -> tuple[dict | None, Trajectory | None]:
+    """Distances from the truth, metres and radians, and the true trajectory; None where it is not known.
+
+    A path to a target has a true pick, but no true path: there are many good ones.
+    """
+    expected = scene.expected(trajectory.wxyz_xyz[-1], trajectory.wxyz_xyz[0])
     if expected is None:
-        return None
+        return None, None
+    expected_path = None if scene.demonstration.target is not None else expected
     distance, angle = pose_error(trajectory.wxyz_xyz[0], expected.wxyz_xyz[0])
-    return {
+    found = {
         "pick_metres": float(distance),
         "pick_radians": float(angle),
-        "path_metres": path_error(trajectory, expected),
+        "path_metres": None if expected_path is None else path_error(trajectory, expected_path),
     }
+    return found, expected_path
 
 
-def _title(loss: float, found: dict | None) -> str:
+def _title(loss: float, found: dict | None, relation: dict | None) -> str:
     """One line over the picture."""
+    known = [] if relation is None or relation["success"] is None else [_placement(relation)]
     if found is None:
-        return f"loss {loss:.4f}; pick and path errors n/a"
+        unknown = "pick and path errors n/a" if relation is None else "pick error n/a"
+        return "; ".join([f"loss {loss:.4f}", unknown, *known])
     angle = np.degrees(found["pick_radians"])
-    pick = f"pick-pose error {100 * found['pick_metres']:.1f} cm, {angle:.0f}°"
-    return f"loss {loss:.4f}; {pick}; path error {100 * found['path_metres']:.1f} cm"
+    parts = [f"loss {loss:.4f}", f"pick-pose error {100 * found['pick_metres']:.1f} cm, {angle:.0f}°"]
+    if found["path_metres"] is not None:
+        parts.append(f"path error {100 * found['path_metres']:.1f} cm")
+    return "; ".join(parts + known)
+
+
+def _placement(relation: dict) -> str:
+    """How an object is placed on its target, in words."""
+    gap, penetration, tilt = (relation[name] for name in ("gap", "penetration", "tilt"))
+    deep = "more than 10" if penetration is None else f"{1000 * penetration:.0f}"
+    words = [f"gap {1000 * gap:.1f} mm", f"penetration {deep} mm"]
+    words += [] if tilt is None else [f"tilt {tilt:.0f}°"]
+    words += [f"not {name}" for name in ("hung", "supported") if not relation[name]]
+    return f"{'success' if relation['success'] else 'failure'}: {', '.join(words)}"
 
 
 def _record(
@@ -202,11 +237,11 @@ def _record(
     energy: EnergyWeights | None,
     config: CarryConfig | SolveConfig | OptimizeConfig,
     result: Result,
+    relation: dict | None,
     timings: dict[str, float],
 ) -> dict:
     """Everything about a run that result.json holds; numbers that are not finite are null."""
-    trajectory = result.trajectory
-    expected = scene.expected(trajectory.wxyz_xyz[-1], trajectory.wxyz_xyz[0])
+    found, expected = _errors(scene, result.trajectory)
     demonstration = scene.demonstration
     return {
         "schema": SCHEMA,
@@ -231,9 +266,9 @@ def _record(
         "confidence": _plain(float(result.confidence)),
         "recognised": _plain(float(result.recognised)),
         "modes": _modes(config, result),
-        "errors": _errors(trajectory, expected),
+        "errors": found,
         "goal": _plain(result.goal),
-        "relation": _relation(scene, result),
+        "relation": relation,
         "expected": None if expected is None else _plain(expected.wxyz_xyz),
         "energies": _plain(result.energies),
         "losses": _plain(result.candidate_history),
@@ -262,7 +297,8 @@ def _table(record: dict, out: Path) -> str:
     pick = path = "n/a (the truth is not known)"
     if found is not None:
         pick = f"{100 * found['pick_metres']:.2f} cm, {np.degrees(found['pick_radians']):.1f} degrees"
-        path = f"{100 * found['path_metres']:.2f} cm, mean over waypoints"
+        if found["path_metres"] is not None:
+            path = f"{100 * found['path_metres']:.2f} cm, mean over waypoints"
     rows = {
         "run": f"{starts}, {{poses}} poses, {{queries}} queries".format(**sizes),
         "loss, start": f"{record['loss']['start']:.5f}",
@@ -274,8 +310,11 @@ def _table(record: dict, out: Path) -> str:
     }
     if record["relation"] is not None:
         relation = record["relation"]
+        rows["loss, end"] = f"{record['loss']['end']:.5f} (sum of the pick's and both contact regions)"
         angle = np.degrees(relation["moved_radians"])
         rows["object moves"] = f"{100 * relation['moved_metres']:.1f} cm and {angle:.0f} degrees, to the target"
+        if relation["success"] is not None:
+            rows["placement"] = _placement(relation)
     if record["modes"] is not None:
         rows["solutions"] = _solutions(record["modes"])
     if record["recognised"] is not None:
@@ -289,12 +328,13 @@ def _table(record: dict, out: Path) -> str:
     return "\n".join(f"{name:<17}{value}" for name, value in rows.items())
 
 
-def _relation(scene: Scene, result: Result) -> dict | None:
+def _relation(scene: Scene, task: TaskScene | None, result: Result) -> dict | None:
     """Where the object goes on the target; None if the demonstration has no target."""
     if scene.demonstration.target is None:
         return None
     motion = Trajectory(result.object_motion[None]).matrices[0]
     centroid = scene.points.mean(axis=0)
+    judged = not_judged() if task is None else task.judged(result.object_motion)
     moved = pose_error(result.object_motion, np.array([1.0, 0, 0, 0, 0, 0, 0]))[1]
     return {
         "object_motion": _plain(result.object_motion),
@@ -302,6 +342,7 @@ def _relation(scene: Scene, result: Result) -> dict | None:
         "moved_radians": float(moved),
         "T_world_contact": _plain(result.target_trajectories[result.best, 0]),
         "target_residual": _plain(float(result.target_residual)),
+        **{name: _plain(value) for name, value in judged.items()},
     }
 
 

@@ -12,6 +12,7 @@ from jaxtyping import PRNGKeyArray
 from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.cases import QUERY_SIZE, Case, generated_case, place_demonstration, random_pose
+from tdf_jax.evaluation.relation_tasks import RELATIONS
 from tdf_jax.evaluation.scene import Scene
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.query import box_query
@@ -19,10 +20,13 @@ from tdf_jax.io.demonstrations import load_demonstration
 from tdf_jax.io.meshes import load_mesh
 from tdf_jax.io.pointclouds import load_points
 from tdf_jax.landscape.shortest_path import SHARPEST
+from tdf_jax.networks.checkpoint import available_models
 from tdf_jax.shapes import FAMILIES
 
 Category = Literal["mug", "bowl", "bottle", "rack", "container"]
 MULTI = ("mug", "bowl", "bottle")  # categories that the shipped weights `multi` were trained on
+# Options that make or read another demonstration than that of a task.
+CONTRADICT_TASK = ("demonstration", "target_object", "category", "trajectory", "num_poses", "queries")
 
 
 def _option(metavar: str | None = None, default: str | None = None):
@@ -76,10 +80,15 @@ class Settings(SceneSettings):
     """The demonstration, the target and the method of an imitation.
 
     Attributes:
+        target: mesh or point cloud of the new object; the second object is --target-object. With --task, whether the
+            second object is found anew, or known, because it stands where it stood in the demonstration.
+        target_pose: pose of the target in the world: that of its file, or a random rotation and translation of it. With
+            --task, given is upright with a random yaw.
+        task: place a generated object on a generated target, both from one seed, as demonstrated on another such pair.
         goal_offset: translation that is added to the goal, metres, world frame.
         target_object: mesh or point cloud of the object that the new one is placed on or in, in the unit of --target;
             the demonstration file must have one too. Without it the demonstrated one has not moved.
-        target_weights: a name of shipped weights, or a .safetensors file, for --target-object.
+        target_weights: a name of shipped weights, or a .safetensors file, for --target-object or the target of --task.
         k: weight of the correlation term of eq. 3, for the methods that minimise it; the paper's best is 0.02.
         method: carry the demonstration from the pick to the goal; or minimise the paper's energy, eq. 3, by damped
             Gauss-Newton, or by Adam as in the paper.
@@ -90,9 +99,11 @@ class Settings(SceneSettings):
         json: print result.json instead of the table.
     """
 
+    target: Annotated[Path | None, _option("FILE|known|found", "a generated object; found with --task")] = None
+    task: Annotated[Literal["bowl_on_mug", "mug_on_rack", "bottle_in_container"] | None, _option(default="none")] = None
     goal_offset: Annotated[tuple[float, float, float], _option("X Y Z")] = (0.0, 0.0, 0.0)
     target_object: Annotated[Path | None, _option("FILE", "none")] = None
-    target_weights: Annotated[str | None, _option("NAME|FILE", "those of --weights")] = None
+    target_weights: Annotated[str | None, _option("NAME|FILE", "those of --weights, or of the category")] = None
     k: Annotated[float | None, _option("FLOAT", "0.02")] = None
     method: Literal["carry", "gauss-newton", "adam"] = "carry"
     num_starts: Annotated[int | None, _option("INT", "64 of the pick; 10 of other methods")] = None
@@ -171,6 +182,8 @@ def resolved(settings: AnySettings) -> AnySettings:
     Raises:
         InputError: a bad number, or options that contradict each other.
     """
+    if isinstance(settings, Settings) and settings.task is not None:
+        return cast(AnySettings, _resolved_task(settings))
     _check_numbers(settings)
     category = settings.category or categories_of(settings.weights)[0]
     settings = dataclasses.replace(settings, category=category, weights=settings.weights or category)
@@ -197,6 +210,64 @@ def resolved(settings: AnySettings) -> AnySettings:
     return dataclasses.replace(settings, target_pose=pose)
 
 
+def _resolved_task(settings: Settings) -> Settings:
+    """The settings of a task; its own demonstration contradicts others."""
+    task = cast(str, settings.task)
+    known = str(settings.target) == "known"
+    if settings.target is not None and str(settings.target) not in ("known", "found"):
+        raise InputError(
+            f"tdf imitate: --target is {settings.target} and --task is {task}; expected --target known or found; a "
+            "file needs a --demonstration instead of --task"
+        )
+    for name in CONTRADICT_TASK:
+        value = getattr(settings, name)
+        if value is not None:
+            option = "--" + name.replace("_", "-")
+            raise InputError(
+                f"tdf imitate: {option} is {value} and --task is {task}; expected one of the two, because a task "
+                "generates its objects and its demonstration; drop one"
+            )
+    if settings.method != "carry":
+        raise InputError(
+            f"tdf imitate: --method is {settings.method} and --task is {task}; expected carry, which alone finds a "
+            "goal on a target; drop one"
+        )
+    if any(settings.goal_offset):
+        raise InputError(
+            f"tdf imitate: --goal-offset is {settings.goal_offset} and --task is {task}; expected none, because the "
+            "goal is found on the target; drop one"
+        )
+    if known and settings.target_weights is not None:
+        raise InputError(
+            f"tdf imitate: --target-weights is {settings.target_weights} and --target is known; expected none, because "
+            "no region is searched on a target that has not moved; drop it, or take --target found"
+        )
+    # A word, and not a file.
+    _check_numbers(dataclasses.replace(settings, target=None, target_weights=None))
+    relation = RELATIONS[task]
+    return dataclasses.replace(
+        settings,
+        target=Path("known" if known else "found"),
+        category=cast(Category, relation.object),
+        weights=settings.weights or _shipped(task, relation.object, "--weights"),
+        target_weights=None
+        if known
+        else settings.target_weights or _shipped(task, relation.target, "--target-weights"),
+        target_pose=settings.target_pose or "random",
+    )
+
+
+def _shipped(task: str, category: str, option: str) -> str:
+    """The name of a category's shipped weights, if there are any."""
+    names = available_models()
+    if category not in names:
+        raise InputError(
+            f"tdf imitate: --task {task} needs weights of a {category}, and none are shipped (shipped are "
+            f"{', '.join(names)}); give {option} FILE, from tdf train"
+        )
+    return category
+
+
 def _check_numbers(settings: SceneSettings) -> None:
     checks.seed(settings.COMMAND, settings.seed, "--seed")
     for name, given in (("scale", settings.scale != 1), ("drop-invalid", settings.drop_invalid)):
@@ -218,7 +289,7 @@ def _check_numbers(settings: SceneSettings) -> None:
                 "tdf imitate: --target-object needs a --demonstration with a target; give one, see tdf demonstrate"
             )
         if settings.target_weights is not None and settings.target_object is None:
-            raise InputError("tdf imitate: --target-weights is for a --target-object; give one, or drop it")
+            raise InputError("tdf imitate: --target-weights is for a --target-object or a --task; give one, or drop it")
     if isinstance(settings, LandscapeSettings):
         for name in ("half", "radius", "pitch"):
             checks.positive("tdf landscape", f"--{name}", getattr(settings, name), "metres")

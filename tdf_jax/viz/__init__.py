@@ -11,6 +11,7 @@ Modules:
     paper: the paper's figures
     polygons3d: solids in 3-D axes
     reconstruction: surfaces and transfers
+    relations: an object placed on a target
     scene3d: an object with a trajectory
     style: colours, sizes, saving
     training: curves of a training run
