@@ -298,6 +298,7 @@ def carry_object(
         InputError: as for `solve`, or the demonstration has no target.
     """
     relations = find_relations("imitate()", objects, reference, key, config, seat)
+    assert reference.contact is not None  # `find_relations` has refused it
     plain = dataclasses.replace(reference, approach=reference.approach[:0], retreat=reference.retreat[:0])
     picked = carry(objects.field, plain, key, fix_last=False, config=config, progress=progress, device_mesh=device_mesh)
     picks, motions = np.asarray(picked.picks), np.asarray(relations.motions)
@@ -310,6 +311,7 @@ def carry_object(
         jnp.asarray(picks[rows]),
         jnp.asarray(motions[columns]),
         jnp.asarray(relations.target_contacts[columns]),
+        reference.contact.arrival,
     )
     result = dataclasses.replace(
         picked,
@@ -337,9 +339,9 @@ def _released_contact(reference: Reference) -> Float[Array, "7"]:
 
 
 @jax.jit
-def _carried(path: Trajectory, released_contact, picks, motions, target_contacts):
+def _carried(path: Trajectory, released_contact, picks, motions, target_contacts, arrival):
     def one(pick, motion, target_contact):
         target_motion = se3.compose(target_contact, se3.inverse(released_contact))
-        return carry_to_target(path, pick, se3.compose(motion, pick), target_motion).wxyz_xyz
+        return carry_to_target(path, pick, se3.compose(motion, pick), target_motion, arrival=arrival).wxyz_xyz
 
     return jax.vmap(one)(picks, motions, target_contacts)

@@ -11,7 +11,7 @@ from conftest import QUERIES, carried, composed, random_cloud, random_poses
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
-from tdf_jax.geometry.transport import carry_to_target
+from tdf_jax.geometry.transport import BEYOND, NEAR, arrival_length, carry_to_target
 
 KEY = jax.random.key(3)
 SEARCH = tdf.CarryConfig(num_starts=256, num_coarse_queries=8, coarse_steps=10, polish_steps=60)
@@ -191,3 +191,19 @@ def test_a_target_survives_the_file(tmp_path, related):
     again = tdf.load_demonstration(tmp_path / "demo.npz")
     for name in ("points", "query", "T_world_contact"):
         np.testing.assert_allclose(getattr(again.target, name), getattr(related.target, name), atol=1e-6)
+
+
+def test_the_arrival_is_as_long_as_the_object_is_near_its_target():
+    """A small cloud comes down 0.3 m onto a plate, from 1 m beside it."""
+    rng = np.random.default_rng(0)
+    cloud = 0.01 * rng.normal(size=(80, 3))
+    plate = rng.uniform(-0.2, 0.2, (2000, 3)) * [1, 1, 0] + [1.0, 0.0, 0.0]
+    corners = np.array([[0.0, 0, 0], [0, 0, 0.3], [1, 0, 0.3], [1, 0, 0]])
+    steps = [np.linspace(a, b, 60, endpoint=False) for a, b in zip(corners, corners[1:])]
+    translations = np.concatenate([*steps, corners[-1:]])
+    path = tdf.Trajectory(jnp.asarray(np.column_stack([np.tile([1.0, 0, 0, 0], (len(translations), 1)), translations])))
+    target = tdf.Target(plate, 0.01 * rng.normal(size=(5, 3)), [1, 0, 0, 0, 1, 0, 0.0])
+    demonstration = tdf.Demonstration(cloud, path, 0.01 * rng.normal(size=(5, 3)), target=target)
+    lowest = -cloud[:, 2].min()
+    # Near from 5 cm below the cloud's lowest point on; the first pose there may be up to a step of 5 mm lower.
+    assert NEAR + lowest + BEYOND - 0.012 < arrival_length(demonstration) < NEAR + lowest + BEYOND + 0.012

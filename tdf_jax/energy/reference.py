@@ -17,6 +17,7 @@ from tdf_jax.energy.seating import touch_distance
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.geometry.transport import arrival_length
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.model import Model
 
@@ -35,6 +36,7 @@ COMBINATIONS = ("mean", "median")
         "target_points",
         "down",
         "touch",
+        "arrival",
     ],
     meta_fields=[],
 )
@@ -56,6 +58,8 @@ class Contact:
         touch: how far down the demonstrated object touches its target from its pose at the release, metres, see
             `tdf_jax.energy.seating`; the median of several demonstrations. NaN if it does not touch from above, or is
             not known.
+        arrival: length of the demonstrated path before the release on which the object is near its target, metres, see
+            `arrival_length`.
     """
 
     query: Float[Array, "queries 3"]
@@ -67,6 +71,7 @@ class Contact:
     target_points: Float[Array, "target_points 3"]
     down: Float[Array, "3"]
     touch: Float[Array, ""]
+    arrival: Float[Array, ""]
 
 
 def _no_poses() -> Array:
@@ -191,6 +196,7 @@ def _contact(demonstrations, fields, target_model, combine) -> Contact | None:
         jnp.asarray(first.points, on_object.dtype),
         -se3.rotation(T_world_contact)[2],
         jnp.asarray(_touch(demonstrations, fields, target_fields), on_object.dtype),
+        jnp.asarray(arrival_length(demonstrations[0]), on_object.dtype),
     )
 
 

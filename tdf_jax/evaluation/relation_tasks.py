@@ -250,7 +250,9 @@ def _bowl_on_mug(bowl: Shape, mug: Shape) -> tuple[np.ndarray, np.ndarray] | Non
 
 
 def _bottle_in_container(bottle: Shape, container: Shape) -> tuple[np.ndarray, np.ndarray] | None:
-    """The bottle upright in the middle of the floor."""
+    """The bottle upright in the middle of the floor of a container that is open above."""
+    if container.parameters.style == "shelf":
+        return None  # a path from above, as of the other containers, would go through its ceiling
     T_target_contact = container.frames["floor"].copy()
     T_target_object = T_target_contact.copy()
     T_target_object[2, 3] -= bottle.mesh.bounds[0, 2]

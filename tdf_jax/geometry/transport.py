@@ -2,16 +2,21 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import public
 from tdf_jax.geometry import se3
+from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory, check_trajectory
 
 # Metres of the path that repeat the demonstration after the pick and before the goal, where the object is close to what
 # it stood on and to the target. The arrival is longer: an object has to move along a peg or into a container.
 DEPARTURE, ARRIVAL = 0.05, 0.08
+NEAR = 0.05  # metres from the target within which an object repeats its demonstrated arrival
+BEYOND = 0.02  # metres that the arrival begins before it comes so near
+SPARSE = 300  # points of the object's cloud by which its distance is measured
 MAX_ENDS = 0.8  # largest share of the path that both take: the rest blends the two, without a jump between poses
 
 
@@ -57,7 +62,7 @@ def carry_to_target(
     target_motion: Float[Array, "7"],
     *,
     departure: float = DEPARTURE,
-    arrival: float = ARRIVAL,
+    arrival: float | Float[Array, ""] = ARRIVAL,
 ) -> Trajectory:
     """Warp a demonstrated path between a pick and a goal at a target, repeating the demonstrated motion at both ends.
 
@@ -96,6 +101,32 @@ def carry_to_target(
     R = se3.geodesic(se3.rotation(leaving), se3.rotation(arriving), s)
     t = (1 - s)[:, None] * leaving[:, 4:] + s[:, None] * arriving[:, 4:]
     return Trajectory(se3.pose(R, t))
+
+
+def arrival_length(demonstration: Demonstration) -> float:
+    """Length of a demonstrated path before the release on which the object is near its target.
+
+    Args:
+        demonstration: a demonstration with a target.
+
+    Returns:
+        The length of the last part on which the clouds of the object and its target are within `NEAR`, and `BEYOND`,
+            metres; at least `ARRIVAL`, which it is too if an array is traced.
+    """
+    from scipy.spatial import KDTree
+
+    target = demonstration.target
+    path = demonstration.transfer.wxyz_xyz
+    if target is None or checks.traced(demonstration.points, target.points, path):
+        return ARRIVAL
+    poses = jnp.asarray(path)
+    cloud = jnp.asarray(demonstration.points)[:: -(-len(demonstration.points) // SPARSE)]
+    carried = se3.transform(se3.compose(poses, se3.inverse(poses[0])), cloud)
+    tree = KDTree(np.asarray(target.points, float))
+    far = np.array([tree.query(np.asarray(points, float))[0].min() > NEAR for points in carried])
+    steps = np.linalg.norm(np.diff(np.asarray(poses[:, 4:], float), axis=0), axis=1)
+    last = np.flatnonzero(far)
+    return max(ARRIVAL, float(steps[last[-1] if len(last) else 0 :].sum()) + BEYOND)
 
 
 @jax.jit
