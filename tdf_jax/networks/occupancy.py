@@ -26,6 +26,7 @@ from jaxtyping import Array, Bool, Float
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.deprecation import renamed_fields
+from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.precision import full_precision
 from tdf_jax.networks.vector_neurons import (
     EdgeConvolution,
@@ -50,7 +51,8 @@ class NetworkConfig:
     Attributes:
         latent: number of 3-vectors in the latent.
         vector_hidden: encoder channels inside and between the residual blocks.
-        vector_width: encoder channels at a residual block's input (after the pooled mean is appended).
+        vector_width: encoder channels at a residual block's input, after the pooled mean is appended: twice
+            `vector_hidden`, unless there is one block only.
         decoder_width: width of the decoder.
         blocks: residual blocks, in the encoder and in the decoder.
         neighbours: nearest neighbours of an edge feature, the point itself included.
@@ -76,6 +78,11 @@ class NetworkConfig:
         for field in dataclasses.fields(self):
             if field.type is int:
                 checks.count("NetworkConfig()", field.name, getattr(self, field.name))
+        if self.blocks > 1 and self.vector_width != 2 * self.vector_hidden:
+            raise InputError(
+                f"NetworkConfig(): vector_width is {self.vector_width} and vector_hidden {self.vector_hidden}; expected a "
+                "width of twice the hidden channels, which are joined with their mean from the second block on"
+            )
         checks.number("NetworkConfig()", "slope", self.slope)
         checks.positive("NetworkConfig()", "scaling", self.scaling)
         offset = self.symmetry_breaking_offset

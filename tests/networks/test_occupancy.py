@@ -11,6 +11,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from scipy.spatial import cKDTree
 
 import tdf_jax as tdf
+from tdf_jax._internal.errors import InputError
 from tdf_jax.networks import occupancy, vector_neurons
 from tdf_jax.networks.occupancy import condition, decode
 from tdf_jax.networks.vector_neurons import EdgeConvolution, nearest_neighbours
@@ -166,3 +167,9 @@ def test_a_decoder_is_one_function_of_the_point(small_model):
     np.testing.assert_allclose(logit, logits[1, 2, 3], rtol=1e-5)
     for part, single in zip(activations, one, strict=True):
         np.testing.assert_allclose(part[1, 2, 3], single, rtol=1e-5, atol=1e-6)
+
+
+def test_a_width_that_the_second_block_cannot_take_is_refused():
+    with pytest.raises(InputError, match="vector_width is 128 and vector_hidden 128; expected a width of twice"):
+        tdf.NetworkConfig(vector_width=128)
+    assert tdf.NetworkConfig(vector_width=128, blocks=1).blocks == 1
