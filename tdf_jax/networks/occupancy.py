@@ -80,8 +80,8 @@ class NetworkConfig:
                 checks.count("NetworkConfig()", field.name, getattr(self, field.name))
         if self.blocks > 1 and self.vector_width != 2 * self.vector_hidden:
             raise InputError(
-                f"NetworkConfig(): vector_width is {self.vector_width} and vector_hidden {self.vector_hidden}; expected a "
-                "width of twice the hidden channels, which are joined with their mean from the second block on"
+                f"NetworkConfig(): vector_width is {self.vector_width} and vector_hidden {self.vector_hidden}; "
+                "expected twice as wide: hidden channels are joined with their mean from the second block on"
             )
         checks.number("NetworkConfig()", "slope", self.slope)
         checks.positive("NetworkConfig()", "scaling", self.scaling)

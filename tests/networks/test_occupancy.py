@@ -170,6 +170,6 @@ def test_a_decoder_is_one_function_of_the_point(small_model):
 
 
 def test_a_width_that_the_second_block_cannot_take_is_refused():
-    with pytest.raises(InputError, match="vector_width is 128 and vector_hidden 128; expected a width of twice"):
+    with pytest.raises(InputError, match="vector_width is 128 and vector_hidden 128; expected twice as wide"):
         tdf.NetworkConfig(vector_width=128)
     assert tdf.NetworkConfig(vector_width=128, blocks=1).blocks == 1
