@@ -117,7 +117,7 @@ def test_the_new_pair_is_another_and_the_true_motion_is_a_success(made):
     lifted = placement.motion.copy()
     lifted[:3, 3] += placement.T_world_target[:3, 2] * 0.01
     record = made.judged(jnp.asarray(pose(lifted)))
-    assert not record["success"] and record["gap"] == pytest.approx(0.01, abs=1e-3)
+    assert not record["success"] and 0.005 < record["gap"] < 0.0105  # to the floor, or to a nearer wall
 
 
 def test_given_poses_are_upright():
