@@ -292,7 +292,7 @@ def carry_object(
         device_mesh: see `solve`; for the pick.
 
     Returns:
-        The result; its candidates are pairs of a pick and a motion, by the sum of their energies.
+        The result; its candidates are pairs of a distinct pick and a distinct motion, by the sum of their energies.
 
     Raises:
         InputError: as for `solve`, or the demonstration has no target.
@@ -302,9 +302,14 @@ def carry_object(
     plain = dataclasses.replace(reference, approach=reference.approach[:0], retreat=reference.retreat[:0])
     picked = carry(objects.field, plain, key, fix_last=False, config=config, progress=progress, device_mesh=device_mesh)
     picks, motions = np.asarray(picked.picks), np.asarray(relations.motions)
-    joint = np.where(np.asarray(picked.finite), np.asarray(picked.energies), np.inf)[:, None] + relations.energies
+    # One candidate of every distinct pick; all of them if none is finite, so that the result says so.
+    modes = cluster_poses(jnp.asarray(picks), jnp.asarray(picked.energies))
+    distinct = np.array([mode.members[0] for mode in modes]) if modes else np.arange(len(picks))
+    pick_energies = np.where(np.asarray(picked.finite), np.asarray(picked.energies), np.inf)[distinct]
+    joint = pick_energies[:, None] + relations.energies
     order = np.argsort(joint, axis=None, kind="stable")[:MAX_SOLUTIONS]
     rows, columns = np.unravel_index(order, joint.shape)
+    energies, rows = joint[rows, columns], distinct[rows]
     trajectories = _carried(
         _dense(reference.trajectory),
         _released_contact(reference),
@@ -316,7 +321,7 @@ def carry_object(
     result = dataclasses.replace(
         picked,
         trajectories=trajectories,
-        energies=jnp.asarray(joint[rows, columns].astype(picked.energies.dtype)),
+        energies=jnp.asarray(energies.astype(picked.energies.dtype)),
         candidate_history=jnp.asarray(picked.candidate_history)[rows],
         target_trajectories=jnp.asarray(relations.target_contacts[columns][:, None]),
         target_residual=np.asarray(relations.target_residual, np.float32),

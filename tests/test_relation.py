@@ -75,6 +75,8 @@ def test_every_candidate_ends_where_its_own_pick_and_motion_lead(result):
     contacts = np.asarray(result.target_trajectories)[:, 0]
     assert contacts.shape == (len(picks), 7) and len(picks) > 1
     assert (np.diff(result.energies) >= 0).all() and result.best == 0
+    pairs = {(tuple(np.round(pick, 2)), tuple(np.round(motion, 2))) for pick, motion in zip(picks, motions)}
+    assert len(pairs) == len(picks)  # no candidate is there twice
     same = np.array([np.allclose(matrices(motion), matrices(motions[0]), atol=1e-4) for motion in motions])
     assert same.sum() > 1  # several picks share the best motion, each with its own end
     assert (
