@@ -10,7 +10,8 @@ from tdf_jax.networks.field import DescriptorField
 REACH = 0.015  # metres; an object that touches nothing within it is not moved
 STEPS = 15  # tested displacements each way; between them the occupancy is interpolated
 OCCUPIED = 0.5  # occupancy that counts as touching
-RANK = 3  # the touch is that of the third point, so that one wrong value does not decide
+RANK = 2  # the touch is that of the second point, so that one wrong value does not decide
+NEIGHBOURS = 4  # points half way to the nearest neighbours are tested too: few points of a cloud are on a thin peg
 BESIDE = 0.01  # metres across the direction within which a point may meet the other object
 POINTS = 256  # points of each object that are tested
 
@@ -42,7 +43,7 @@ def touch_distance(
     """
     motion, direction = jnp.asarray(motion, jnp.float32), np.asarray(direction, float)
     placed = np.asarray(se3.transform(motion, jnp.asarray(points, jnp.float32)), float)
-    near, target_near = _meeting(placed, np.asarray(target_points, float), direction)
+    near, target_near = _meeting(_denser(placed), _denser(np.asarray(target_points, float)), direction)
     if not len(near):
         return np.nan
     steps = np.linspace(-REACH, REACH, 2 * STEPS + 1)
@@ -53,6 +54,16 @@ def touch_distance(
         moved = jnp.asarray(near + shifts, jnp.float32).reshape(-1, 3)
         occupied.append(_highest(target, moved, len(steps), len(near)))
     return _first_touch(steps, np.max(occupied, axis=0))
+
+
+def _denser(points: np.ndarray) -> np.ndarray:
+    """A cloud and the points half way between neighbours."""
+    from scipy.spatial import KDTree
+
+    _, near = KDTree(points).query(points, min(NEIGHBOURS + 1, len(points)))
+    one, other = np.repeat(np.arange(len(points)), near.shape[1] - 1), near[:, 1:].ravel()
+    once = one < other
+    return np.concatenate([points, (points[one[once]] + points[other[once]]) / 2])
 
 
 def _meeting(points, target_points, direction) -> tuple[np.ndarray, np.ndarray]:
