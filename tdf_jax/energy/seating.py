@@ -60,8 +60,9 @@ def _denser(points: np.ndarray) -> np.ndarray:
     """A cloud and the points half way between neighbours."""
     from scipy.spatial import KDTree
 
-    _, near = KDTree(points).query(points, min(NEIGHBOURS + 1, len(points)))
-    one, other = np.repeat(np.arange(len(points)), near.shape[1] - 1), near[:, 1:].ravel()
+    order = np.arange(2, min(NEIGHBOURS + 1, len(points)) + 1)  # the first neighbour is the point itself
+    other = np.asarray(KDTree(points).query(points, order)[1]).ravel()
+    one = np.repeat(np.arange(len(points)), len(order))
     once = one < other
     return np.concatenate([points, (points[one[once]] + points[other[once]]) / 2])
 
