@@ -60,9 +60,8 @@ def _denser(points: np.ndarray) -> np.ndarray:
     """A cloud and the points half way between neighbours."""
     from scipy.spatial import KDTree
 
-    order = np.arange(2, min(NEIGHBOURS + 1, len(points)) + 1)  # the first neighbour is the point itself
-    other = np.asarray(KDTree(points).query(points, order)[1]).ravel()
-    one = np.repeat(np.arange(len(points)), len(order))
+    nearest = np.asarray(KDTree(points).query(points, min(NEIGHBOURS + 1, len(points)))[1]).reshape(len(points), -1)
+    one, other = np.repeat(nearest[:, 0], nearest.shape[1] - 1), nearest[:, 1:].ravel()  # the first is the point itself
     once = one < other
     return np.concatenate([points, (points[one[once]] + points[other[once]]) / 2])
 
