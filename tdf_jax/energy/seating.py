@@ -14,6 +14,7 @@ RANK = 2  # the touch is that of the second point, so that one wrong value does 
 NEIGHBOURS = 4  # points half way to the nearest neighbours are tested too: few points of a cloud are on a thin peg
 BESIDE = 0.01  # metres across the direction within which a point may meet the other object
 POINTS = 256  # points of each object that are tested
+SHAPES = 128  # the points are filled up to a multiple of it, so that few programs are compiled
 
 
 def touch_distance(
@@ -41,18 +42,18 @@ def touch_distance(
         The displacement, metres: positive along the direction if there is a gap, negative if the two overlap; NaN if
             they do not touch, or overlap still, within `REACH`.
     """
-    motion, direction = jnp.asarray(motion, jnp.float32), np.asarray(direction, float)
-    placed = np.asarray(se3.transform(motion, jnp.asarray(points, jnp.float32)), float)
-    near, target_near = _meeting(_denser(placed), _denser(np.asarray(target_points, float)), direction)
+    # In NumPy but for the fields: the number of points differs from call to call, and JAX would compile for each.
+    R, t = np.asarray(se3.rotation(jnp.asarray(motion)), float), np.asarray(motion, float)[4:]
+    direction, target_points = np.asarray(direction, float), np.asarray(target_points, float)
+    placed = np.asarray(points, float) @ R.T + t
+    near, target_near = _meeting(_denser(placed), _denser(target_points), direction)
     if not len(near):
         return np.nan
     steps = np.linspace(-REACH, REACH, 2 * STEPS + 1)
     shifts = steps[:, None, None] * direction
-    back = se3.transform(se3.inverse(motion), jnp.asarray(target_near - shifts, jnp.float32).reshape(-1, 3))
-    occupied = [_highest(field, back, len(steps), len(target_near))]
+    occupied = [_highest(field, (target_near - shifts - t) @ R)]
     if target is not None:
-        moved = jnp.asarray(near + shifts, jnp.float32).reshape(-1, 3)
-        occupied.append(_highest(target, moved, len(steps), len(near)))
+        occupied.append(_highest(target, near + shifts))
     return _first_touch(steps, np.max(occupied, axis=0))
 
 
@@ -81,11 +82,12 @@ def _meeting(points, target_points, direction) -> tuple[np.ndarray, np.ndarray]:
     return points[mine], target_points[other]
 
 
-def _highest(field: DescriptorField, x: Float[Array, "all 3"], steps: int, count: int) -> np.ndarray:
-    """The occupancy of the `RANK`-th point at every displacement, (steps,)."""
-    padded = -(-count // 64) * 64  # few shapes, so that few programs are compiled
-    filled = jnp.zeros((steps, padded, 3), x.dtype).at[:, :count].set(x.reshape(steps, count, 3))
-    occupancy = np.asarray(field.occupancy(filled.reshape(-1, 3))).reshape(steps, padded)[:, :count]
+def _highest(field: DescriptorField, x: Float[np.ndarray, "steps count 3"]) -> Float[np.ndarray, " steps"]:
+    """The occupancy of the `RANK`-th point at every displacement."""
+    steps, count, _ = x.shape
+    padded = np.zeros((steps, -(-count // SHAPES) * SHAPES, 3), np.float32)
+    padded[:, :count] = x
+    occupancy = np.asarray(field.occupancy(jnp.asarray(padded.reshape(-1, 3)))).reshape(steps, -1)[:, :count]
     return np.sort(occupancy, axis=1)[:, -min(RANK, count)]
 
 
