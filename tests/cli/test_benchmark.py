@@ -524,3 +524,38 @@ def test_demonstrations_need_not_begin_with_one():
         {"clouds": "full", "count": 5, "way": way, "distances": [0.01], "angles": [5.0]} for way in ("mean", "median")
     ]
     assert {len(line) for line in steps(demonstrations_figure(found).axes[0]).values()} == {1}
+
+
+# ---- relations ----
+
+BOTTLES = ("--relations", "--tasks", "bottle_in_container", "--target-weights", "multi")
+
+
+@pytest.mark.slow
+def test_relations_are_measured_and_reported(tmp_path, capsys):
+    run(*BOTTLES, "--methods", "centroids", "--pairs", 2, "--pose", "upright", "tilt60", "--out", tmp_path)
+    assert capsys.readouterr().out.strip() == str(tmp_path / "relations.md")
+    text = (tmp_path / "relations.md").read_text()
+    assert "## Bottle in container" in text and text.count("| centroids | 2 |") == 2
+    found = json.loads((tmp_path / "relations.json").read_text())
+    assert found["weights"] == {"bottle_in_container": ["bottle", "multi"]} and len(found["placements"]) == 4
+    assert [row["poses"] for row in found["rows"]] == ["upright", "tilt60"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--methods", "magic"), "--methods is 'magic'; expected one of tdf_jax"),
+        (("--clouds", "half"), "--clouds is 'half'; expected no condition of size with --relations"),
+        (("--demonstrations", "3"), "--demonstrations is 3; expected one of 1, 10"),
+        (("--pairs", "0"), "--pairs is 0"),
+        (("--seed", "-1"), "--seed is -1"),
+        (("--target-weights", "mug"), "--tasks need weights of container, mug, rack; expected tasks of one category"),
+        (("--tasks", "mug_on_rack"), "there are no weights 'rack'"),
+    ],
+)
+def test_bad_relations_are_refused(words, message, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        run("--relations", *words, "--out", tmp_path / "out")
+    assert ended.value.code == 2 and message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
