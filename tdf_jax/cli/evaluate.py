@@ -19,8 +19,9 @@ PICTURES = ("reconstructions.png", "transfers.png")
 MOST_GENERATED = 6  # generated objects of a category in a picture
 _NONE = "(default: none)"
 Cloud = Literal[
-    "full", "views1", "views2", "views3", "views4", "points300", "points1000", "points3000", "noise", "half", "double", "all"
-]
+    "full", "views1", "views2", "views3", "views4", "points300", "points1000", "points3000", "noise", "half", "double",
+    "all",
+]  # fmt: skip
 
 
 def evaluate(
