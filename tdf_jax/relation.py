@@ -24,7 +24,7 @@ from tdf_jax.energy.seating import touch_distance
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory, resample
-from tdf_jax.geometry.transport import carry_to_target
+from tdf_jax.geometry.transport import arrival_depth, carry_to_target
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.field import DescriptorField
 from tdf_jax.networks.model import Model
@@ -310,13 +310,24 @@ def carry_object(
     order = np.argsort(joint, axis=None, kind="stable")[:MAX_SOLUTIONS]
     rows, columns = np.unravel_index(order, joint.shape)
     energies, rows = joint[rows, columns], distinct[rows]
+    contact, points = reference.contact, np.asarray(objects.points, float)
+    target_points = contact.target_points if objects.target_points is None else objects.target_points
+    deeper = [
+        max(
+            0.0, arrival_depth(_moved(points, motion), np.asarray(target_points, float), outward) - float(contact.depth)
+        )
+        for motion, outward in zip(
+            motions, np.asarray(se3.rotation(jnp.asarray(relations.target_contacts)) @ contact.outward, float)
+        )
+    ]
     trajectories = _carried(
         _dense(reference.trajectory),
         _released_contact(reference),
         jnp.asarray(picks[rows]),
         jnp.asarray(motions[columns]),
         jnp.asarray(relations.target_contacts[columns]),
-        reference.contact.arrival,
+        contact.arrival,
+        jnp.asarray(deeper, motions.dtype)[columns],
     )
     result = dataclasses.replace(
         picked,
@@ -343,10 +354,16 @@ def _released_contact(reference: Reference) -> Float[Array, "7"]:
     return se3.compose(se3.compose(poses[-1], se3.inverse(poses[0])), contact.T_object_contact)
 
 
-@jax.jit
-def _carried(path: Trajectory, released_contact, picks, motions, target_contacts, arrival):
-    def one(pick, motion, target_contact):
-        target_motion = se3.compose(target_contact, se3.inverse(released_contact))
-        return carry_to_target(path, pick, se3.compose(motion, pick), target_motion, arrival=arrival).wxyz_xyz
+def _moved(points, motion):
+    R = np.asarray(se3.rotation(jnp.asarray(motion)), float)
+    return points @ R.T + np.asarray(motion, float)[4:]
 
-    return jax.vmap(one)(picks, motions, target_contacts)
+
+@jax.jit
+def _carried(path: Trajectory, released_contact, picks, motions, target_contacts, arrival, deeper):
+    def one(pick, motion, target_contact, deeper):
+        target_motion = se3.compose(target_contact, se3.inverse(released_contact))
+        goal = se3.compose(motion, pick)
+        return carry_to_target(path, pick, goal, target_motion, arrival=arrival, deeper=deeper).wxyz_xyz
+
+    return jax.vmap(one)(picks, motions, target_contacts, deeper)

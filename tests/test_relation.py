@@ -11,7 +11,7 @@ from conftest import QUERIES, carried, composed, random_cloud, random_poses
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
-from tdf_jax.geometry.transport import BEYOND, NEAR, arrival_length, carry_to_target
+from tdf_jax.geometry.transport import BEYOND, NEAR, arrival_depth, arrival_of, carry_to_target
 
 KEY = jax.random.key(3)
 SEARCH = tdf.CarryConfig(num_starts=256, num_coarse_queries=8, coarse_steps=10, polish_steps=60)
@@ -195,17 +195,45 @@ def test_a_target_survives_the_file(tmp_path, related):
         np.testing.assert_allclose(getattr(again.target, name), getattr(related.target, name), atol=1e-6)
 
 
+def cube(size, count=2000, seed=0):
+    """A cloud of a cube's surface, with its corners."""
+    points = np.random.default_rng(seed).uniform(-0.5, 0.5, (count, 3))
+    points[np.arange(count), np.arange(count) % 3] = np.where(np.arange(count) % 2, 0.5, -0.5)
+    corners = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), axis=-1).reshape(-1, 3)
+    return np.concatenate([points, corners]) * size
+
+
 def test_the_arrival_is_as_long_as_the_object_is_near_its_target():
-    """A small cloud comes down 0.3 m onto a plate, from 1 m beside it."""
-    rng = np.random.default_rng(0)
-    cloud = 0.01 * rng.normal(size=(80, 3))
-    plate = rng.uniform(-0.2, 0.2, (2000, 3)) * [1, 1, 0] + [1.0, 0.0, 0.0]
+    """A small cube comes down 0.3 m into the middle of a hollow one of 8 cm, from 1 m beside it."""
     corners = np.array([[0.0, 0, 0], [0, 0, 0.3], [1, 0, 0.3], [1, 0, 0]])
-    steps = [np.linspace(a, b, 60, endpoint=False) for a, b in zip(corners, corners[1:])]
+    steps = [np.linspace(a, b, 150, endpoint=False) for a, b in zip(corners, corners[1:])]
     translations = np.concatenate([*steps, corners[-1:]])
     path = tdf.Trajectory(jnp.asarray(np.column_stack([np.tile([1.0, 0, 0, 0], (len(translations), 1)), translations])))
-    target = tdf.Target(plate, 0.01 * rng.normal(size=(5, 3)), [1, 0, 0, 0, 1, 0, 0.0])
-    demonstration = tdf.Demonstration(cloud, path, 0.01 * rng.normal(size=(5, 3)), target=target)
-    lowest = -cloud[:, 2].min()
-    # Near from 5 cm below the cloud's lowest point on; the first pose there may be up to a step of 5 mm lower.
-    assert NEAR + lowest + BEYOND - 0.012 < arrival_length(demonstration) < NEAR + lowest + BEYOND + 0.012
+    query = 0.01 * np.random.default_rng(1).normal(size=(5, 3))
+    target = tdf.Target(cube([0.08, 0.08, 0.2]) + [1.0, 0, 0], query, [1, 0, 0, 0, 1, 0, 0.0])
+    arrival = arrival_of(tdf.Demonstration(cube(0.02), path, query, target=target))
+    # Its lower side is within 5 cm of the upper side of the target, 10 cm up, from 16 cm on.
+    assert abs(arrival.length - (0.16 + BEYOND)) < 0.006 and NEAR == 0.05
+    np.testing.assert_allclose(arrival.outward, [0, 0, 1], atol=1e-3)
+    assert abs(arrival.depth - 0.11) < 1e-3  # from its lower side to the target's upper one
+    # Of an object beside the target nothing is in the way.
+    assert arrival_depth(cube(0.02) + [0, 0.2, 0], cube(0.08), np.array([0, 0, 1.0])) == 0.0
+
+
+def test_into_a_deeper_target_the_object_comes_from_farther_out():
+    path = tdf.lift_over(60, (0.4, 0.0, 0.05), (0.0, 0.3, 0.2))
+    pick, goal, target_motion = (jnp.asarray(pose) for pose in random_poses(30, 3))
+    plain, deep = (
+        np.asarray(carry_to_target(path, pick, goal, target_motion, deeper=deeper).wxyz_xyz) for deeper in (0.0, 0.05)
+    )
+    np.testing.assert_array_equal(plain[:, :4], deep[:, :4])
+    np.testing.assert_array_equal(plain[[0, -1]], deep[[0, -1]])
+    shift = np.linalg.norm(deep[:, 4:] - plain[:, 4:], axis=1)
+    steps = np.linalg.norm(np.diff(np.asarray(path.translations, np.float64), axis=0), axis=1)
+    length = np.concatenate([[0.0], np.cumsum(steps)])
+    arriving = length >= length[-1] - 0.08
+    np.testing.assert_allclose(shift[arriving], 0.05 * (length[-1] - length[arriving]) / 0.08, atol=1e-4)
+    assert (np.diff(shift[arriving]) < 0).all() and shift.max() < 0.05 + 1e-6
+    outward = (deep - plain)[arriving][0, 4:]
+    straight = plain[arriving][0, 4:] - plain[-1, 4:]
+    assert outward @ straight > 0.999 * np.linalg.norm(outward) * np.linalg.norm(straight)

@@ -17,7 +17,7 @@ from tdf_jax.energy.seating import touch_distance
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory
-from tdf_jax.geometry.transport import arrival_length
+from tdf_jax.geometry.transport import arrival_of
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.model import Model
 
@@ -37,6 +37,8 @@ COMBINATIONS = ("mean", "median")
         "down",
         "touch",
         "arrival",
+        "outward",
+        "depth",
     ],
     meta_fields=[],
 )
@@ -58,8 +60,10 @@ class Contact:
         touch: how far down the demonstrated object touches its target from its pose at the release, metres, see
             `tdf_jax.energy.seating`; the median of several demonstrations. NaN if it does not touch from above, or is
             not known.
-        arrival: length of the demonstrated path before the release on which the object is near its target, metres, see
-            `arrival_length`.
+        arrival: length of the first demonstration's path before the release on which the object is near its target,
+            metres, see `tdf_jax.geometry.transport.Arrival`.
+        outward: direction from the released object to where its arrival begins, contact frame, (3,).
+        depth: how far the released object has to go back along it until its target is behind it, metres.
     """
 
     query: Float[Array, "queries 3"]
@@ -72,6 +76,8 @@ class Contact:
     down: Float[Array, "3"]
     touch: Float[Array, ""]
     arrival: Float[Array, ""]
+    outward: Float[Array, "3"]
+    depth: Float[Array, ""]
 
 
 def _no_poses() -> Array:
@@ -186,6 +192,7 @@ def _contact(demonstrations, fields, target_model, combine) -> Contact | None:
         )
         on_target = _relative(np.asarray(first.T_world_contact)[None], target_fields[0].origin)[0]
     T_world_contact = jnp.asarray(first.T_world_contact, on_object.dtype)
+    arrival = arrival_of(demonstrations[0])
     return Contact(
         query,
         _combined(seen, combine),
@@ -196,7 +203,9 @@ def _contact(demonstrations, fields, target_model, combine) -> Contact | None:
         jnp.asarray(first.points, on_object.dtype),
         -se3.rotation(T_world_contact)[2],
         jnp.asarray(_touch(demonstrations, fields, target_fields), on_object.dtype),
-        jnp.asarray(arrival_length(demonstrations[0]), on_object.dtype),
+        jnp.asarray(arrival.length, on_object.dtype),
+        jnp.asarray(arrival.outward, on_object.dtype) @ se3.rotation(T_world_contact),
+        jnp.asarray(arrival.depth, on_object.dtype),
     )
 
 

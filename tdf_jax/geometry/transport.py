@@ -1,5 +1,7 @@
 """A demonstrated path warped to new ends."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +18,7 @@ from tdf_jax.geometry.trajectory import Trajectory, check_trajectory
 DEPARTURE, ARRIVAL = 0.05, 0.08
 NEAR = 0.05  # metres from the target within which an object repeats its demonstrated arrival
 BEYOND = 0.02  # metres that the arrival begins before it comes so near
+ASIDE = 0.02  # metres beside an object within which its target stands in its way
 SPARSE = 300  # points of the object's cloud by which its distance is measured
 MAX_ENDS = 0.8  # largest share of the path that both take: the rest blends the two, without a jump between poses
 
@@ -63,6 +66,7 @@ def carry_to_target(
     *,
     departure: float = DEPARTURE,
     arrival: float | Float[Array, ""] = ARRIVAL,
+    deeper: float | Float[Array, ""] = 0.0,
 ) -> Trajectory:
     """Warp a demonstrated path between a pick and a goal at a target, repeating the demonstrated motion at both ends.
 
@@ -81,6 +85,8 @@ def carry_to_target(
         departure: length of the path that repeats the demonstration after the pick, metres.
         arrival: length of the path that repeats the demonstration before the goal, metres. Together the two
             take at most 80 % of the path; otherwise both are shortened in proportion.
+        deeper: how much farther than demonstrated the object arrives from, metres: the arrival is stretched along the
+            line from its end to its begin, as into a container that is deeper than the demonstrated one.
 
     Returns:
         The warped path, T_world_query, with as many poses.
@@ -96,6 +102,10 @@ def carry_to_target(
     total = jnp.maximum(length[-1], 1e-9)
     share = jnp.minimum(1.0, MAX_ENDS * total / (departure + arrival))
     begin, end = share * departure, total - share * arrival
+    left = jnp.clip((total - length) / (total - end), 0.0, 1.0)  # share of the arrival that is left
+    outward = arriving[jnp.argmax(length >= end), 4:] - arriving[-1, 4:]
+    outward = outward / jnp.maximum(jnp.linalg.norm(outward), 1e-9)
+    arriving = arriving.at[:, 4:].add(deeper * left[:, None] * outward)
     s = jnp.clip((length - begin) / (end - begin), 0.0, 1.0)
     s = s * s * (3 - 2 * s)
     R = se3.geodesic(se3.rotation(leaving), se3.rotation(arriving), s)
@@ -103,30 +113,76 @@ def carry_to_target(
     return Trajectory(se3.pose(R, t))
 
 
-def arrival_length(demonstration: Demonstration) -> float:
-    """Length of a demonstrated path before the release on which the object is near its target.
+@dataclasses.dataclass(frozen=True)
+class Arrival:
+    """How the object of a demonstration arrives at its target.
+
+    Attributes:
+        length: length of the path before the release on which the object is near its target, metres.
+        outward: unit vector from the object's place at the release to where the arrival begins, world frame, (3,).
+        depth: how far the released object has to go back along it until its target is behind it, metres.
+    """
+
+    length: float
+    outward: Float[np.ndarray, "3"]
+    depth: float
+
+
+def arrival_of(demonstration: Demonstration) -> Arrival:
+    """How the object of a demonstration arrives at its target.
 
     Args:
         demonstration: a demonstration with a target.
 
     Returns:
-        The length of the last part on which the clouds of the object and its target are within `NEAR`, and `BEYOND`,
-            metres; at least `ARRIVAL`, which it is too if an array is traced.
+        The arrival. Its length is that of the last part of the path on which the clouds of the object and its target
+            are within `NEAR`, and `BEYOND`, at least `ARRIVAL`. If an array is traced the depth is infinite, so that no
+            target is deeper.
     """
     from scipy.spatial import KDTree
 
     target = demonstration.target
     path = demonstration.transfer.wxyz_xyz
     if target is None or checks.traced(demonstration.points, target.points, path):
-        return ARRIVAL
+        return Arrival(ARRIVAL, np.array([0.0, 0.0, 1.0]), np.inf)
     poses = jnp.asarray(path)
     cloud = jnp.asarray(demonstration.points)[:: -(-len(demonstration.points) // SPARSE)]
-    carried = se3.transform(se3.compose(poses, se3.inverse(poses[0])), cloud)
-    tree = KDTree(np.asarray(target.points, float))
-    far = np.array([tree.query(np.asarray(points, float))[0].min() > NEAR for points in carried])
-    steps = np.linalg.norm(np.diff(np.asarray(poses[:, 4:], float), axis=0), axis=1)
-    last = np.flatnonzero(far)
-    return max(ARRIVAL, float(steps[last[-1] if len(last) else 0 :].sum()) + BEYOND)
+    carried = np.asarray(se3.transform(se3.compose(poses, se3.inverse(poses[0])), cloud), float)
+    target_points = np.asarray(target.points, float)
+    tree = KDTree(target_points)
+    far = np.flatnonzero([tree.query(points)[0].min() > NEAR for points in carried])
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(np.asarray(poses[:, 4:]), axis=0), axis=1))])
+    arrival = max(ARRIVAL, float(length[-1] - length[far[-1] if len(far) else 0]) + BEYOND)
+    begin = carried[np.argmax(length >= length[-1] - arrival)]
+    outward = begin.mean(axis=0) - carried[-1].mean(axis=0)
+    outward = outward / max(float(np.linalg.norm(outward)), 1e-9)
+    return Arrival(arrival, outward, arrival_depth(carried[-1], target_points, outward))
+
+
+def arrival_depth(
+    points: Float[np.ndarray, "points 3"],
+    target_points: Float[np.ndarray, "target_points 3"],
+    outward: Float[np.ndarray, "3"],
+) -> float:
+    """How far a placed object has to go back along a direction until its target is behind it.
+
+    Args:
+        points: cloud of the object as it is placed, (points, 3), metres.
+        target_points: cloud of the target, (target_points, 3), metres, same frame.
+        outward: unit vector along which the object would go back, (3,).
+
+    Returns:
+        The distance, metres, at least 0. Points of the target that are more than `ASIDE` beside the object do not
+            count.
+    """
+    if not outward.any():
+        return 0.0
+    across = np.linalg.svd(outward[None])[2][1:].T
+    low, high = (points @ across).min(axis=0) - ASIDE, (points @ across).max(axis=0) + ASIDE
+    beside = ((target_points @ across < low) | (target_points @ across > high)).any(axis=1)
+    if beside.all():
+        return 0.0
+    return max(0.0, float((target_points[~beside] @ outward).max() - (points @ outward).min()))
 
 
 @jax.jit
