@@ -14,7 +14,8 @@ RANK = 2  # the touch is that of the second point, so that one wrong value does 
 NEIGHBOURS = 4  # points half way to the nearest neighbours are tested too: few points of a cloud are on a thin peg
 BESIDE = 0.01  # metres across the direction within which a point may meet the other object
 POINTS = 256  # points of each object that are tested
-SHAPES = 128  # the points are filled up to a multiple of it, so that few programs are compiled
+CLOUD = 2000  # points of each cloud that are looked at; more cost time and memory, and say no more
+PADDING = 128  # the points are filled up to a multiple of it, so that few programs are compiled
 
 
 def touch_distance(
@@ -46,7 +47,7 @@ def touch_distance(
     R, t = np.asarray(se3.rotation(jnp.asarray(motion)), float), np.asarray(motion, float)[4:]
     direction, target_points = np.asarray(direction, float), np.asarray(target_points, float)
     placed = np.asarray(points, float) @ R.T + t
-    near, target_near = _meeting(_denser(placed), _denser(target_points), direction)
+    near, target_near = _meeting(_denser(_thinned(placed)), _denser(_thinned(target_points)), direction)
     if not len(near):
         return np.nan
     steps = np.linspace(-REACH, REACH, 2 * STEPS + 1)
@@ -55,6 +56,13 @@ def touch_distance(
     if target is not None:
         occupied.append(_highest(target, near + shifts))
     return _first_touch(steps, np.max(occupied, axis=0))
+
+
+def _thinned(points: np.ndarray) -> np.ndarray:
+    """At most `CLOUD` points, the same for the same cloud."""
+    if len(points) <= CLOUD:
+        return points
+    return points[np.sort(np.random.default_rng(0).choice(len(points), CLOUD, replace=False))]
 
 
 def _denser(points: np.ndarray) -> np.ndarray:
@@ -85,7 +93,7 @@ def _meeting(points, target_points, direction) -> tuple[np.ndarray, np.ndarray]:
 def _highest(field: DescriptorField, x: Float[np.ndarray, "steps count 3"]) -> Float[np.ndarray, " steps"]:
     """The occupancy of the `RANK`-th point at every displacement."""
     steps, count, _ = x.shape
-    padded = np.zeros((steps, -(-count // SHAPES) * SHAPES, 3), np.float32)
+    padded = np.zeros((steps, -(-count // PADDING) * PADDING, 3), np.float32)
     padded[:, :count] = x
     occupancy = np.asarray(field.occupancy(jnp.asarray(padded.reshape(-1, 3)))).reshape(steps, -1)[:, :count]
     return np.sort(occupancy, axis=1)[:, -min(RANK, count)]

@@ -28,8 +28,8 @@ from tdf_jax.networks.model import Model, fingerprint
 from tdf_jax.relation import Objects, Relations, find_relations
 from tdf_jax.solvers.pick import CarryConfig
 
-FORMAT = 1  # format number; raise it when the computation of a placement or of its verdict changes
-LIBRARY, UNSEATED = "tdf_jax", "tdf_jax, not seated"
+FORMAT = 2  # format number; raise it when the computation of a placement or of its verdict changes
+LIBRARY, UNSEATED = "tdf_jax", "unseated"
 METHODS = (LIBRARY, UNSEATED, "ICP", "centroids")
 DEMONSTRATIONS = 10  # pairs that demonstrate; with one demonstration, each is that of a tenth of the tests
 FIRST_DEMONSTRATION = 1_000_000  # their numbers begin here, so that no test shares their objects
@@ -117,9 +117,11 @@ def run(
         models = networks[condition.task]
         names = fingerprint(models.object), fingerprint(models.target)
         for number in range(pairs):
-            shown = number * DEMONSTRATIONS // pairs if condition.demonstrations == 1 else -1
+            shown = number % DEMONSTRATIONS if condition.demonstrations == 1 else -1
             attempts = _Attempts(condition, number, shown, models, demonstrators[condition.task], seed)
             for method in methods:
+                if shown < 0 and method not in (LIBRARY, UNSEATED):
+                    continue  # a baseline has one demonstration
                 about = [FORMAT, version("tdf_jax"), jax.default_backend(), *names, *condition, number, shown, seed]
                 result = kept("tdf benchmark", folder, [*about, method], functools.partial(attempts.of, method))
                 verdict = Placed(**{field.name: result[field.name].item() for field in dataclasses.fields(Placed)})
