@@ -1,5 +1,5 @@
 # make demo: install and imitate a trajectory on a new mug. make test: install and run the fast tests, in a few minutes.
-# make test-all: every test. make check: format, lint and types. make bench: measure against PyTorch.
+# make test-all: every test. make test-types: fast tests with checked annotations. make check: format, lint and types. make bench: measure against PyTorch.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin

@@ -27,7 +27,8 @@ def raises(expected, *args, match: str | re.Pattern | None = None, raises=pytest
         return raises(expected, *args, match=match, **kwargs)
 
     def refused(error: Exception) -> bool:
-        refused_by_type = "Type-check error" in str(error)  # also where the library repeats the message in its own
+        # Of an argument, not of a result; also where the library repeats the message in its own.
+        refused_by_type = "Type-check error whilst checking the parameters" in str(error)
         return refused_by_type or match is None or re.search(match, str(error)) is not None
 
     return raises((InputError, jaxtyping.TypeCheckError), *args, check=refused, **kwargs)

@@ -1,6 +1,7 @@
 """`tdf benchmark`: imitations of whole trajectories by the library, the paper's energy and baselines."""
 
 import functools
+import typing
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
@@ -31,8 +32,8 @@ def benchmark(
     num_poses: int = 6,
     demonstrations: Annotated[tuple[int, ...], tyro.conf.arg(metavar="INT", help_behavior_hint=_NONE)] = (),
     relations: bool = False,
-    tasks: tuple[Task, ...] = ("bowl_on_mug", "mug_on_rack", "bottle_in_container"),
-    pose: tuple[Pose, ...] = ("upright", "tilt60", "uniform"),
+    tasks: tuple[Task, ...] = typing.get_args(Task),
+    pose: tuple[Pose, ...] = typing.get_args(Pose),
     object_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
     target_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("benchmark"),
@@ -77,6 +78,17 @@ def benchmark(
     from tdf_jax.geometry.winding import libigl
     from tdf_jax.networks.checkpoint import load_model
 
+    _refuse_unused(
+        relations,
+        others={
+            "--weights": weights != "mug", "--height": height != 0.12, "--num-starts": num_starts != 10,
+            "--meshes": meshes is not None, "--recursive": recursive, "--num-poses": num_poses != 6,
+        },
+        own={
+            "--tasks": tasks != typing.get_args(Task), "--pose": pose != typing.get_args(Pose),
+            "--object-weights": object_weights is not None, "--target-weights": target_weights is not None,
+        },
+    )  # fmt: skip
     if relations:
         settings = {
             "pairs": pairs, "seed": seed, "clouds": clouds, "methods": methods,
@@ -124,6 +136,18 @@ def benchmark(
     _draw(out, makers, scores, extras)
 
 
+def _refuse_unused(relations: bool, others: dict[str, bool], own: dict[str, bool]) -> None:
+    """Refuse options of the other benchmark, which would be ignored."""
+    from tdf_jax._internal.errors import InputError
+
+    for flag, given in (others if relations else own).items():
+        if given:
+            raise InputError(
+                f"tdf benchmark: {flag} is {'not for' if relations else 'for'} --relations; expected one without the "
+                f"other; drop {flag}{'' if relations else ', or add --relations'}"
+            )
+
+
 def _relations(out: Path, settings: dict) -> None:
     """`tdf benchmark --relations`."""
     from tdf_jax._internal import checks
@@ -139,9 +163,9 @@ def _relations(out: Path, settings: dict) -> None:
 
     checks.count("tdf benchmark", "--pairs", settings["pairs"])
     checks.seed("tdf benchmark", settings["seed"], "--seed")
-    names = list(METHODS) if "all" in settings["methods"] else settings["methods"]
-    for name in names:
-        checks.choice("tdf benchmark", "--methods", name, METHODS)
+    for name in settings["methods"]:
+        checks.choice("tdf benchmark", "--methods", name, (*METHODS, "all"))
+    names = [name for name in METHODS if {name, "all"} & set(settings["methods"])]
     for flag in ("methods", "clouds", "tasks", "pose"):
         if not settings[flag]:
             raise InputError(f"tdf benchmark: --{flag} is empty; expected at least one")

@@ -232,6 +232,12 @@ def _resolved_task(settings: Settings) -> Settings:
             f"tdf imitate: --method is {settings.method} and --task is {task}; expected carry, which alone finds a "
             "goal on a target; drop one"
         )
+    for name, given in (("scale", settings.scale != 1), ("drop-invalid", settings.drop_invalid)):
+        if given:
+            raise InputError(
+                f"tdf imitate: --{name} is for a file and --task is {task}; expected one of the two, because a task "
+                "generates its objects; drop one"
+            )
     if any(settings.goal_offset):
         raise InputError(
             f"tdf imitate: --goal-offset is {settings.goal_offset} and --task is {task}; expected none, because the "

@@ -20,6 +20,7 @@ from tdf_jax.evaluation.relation_tasks import (
 )
 from tdf_jax.evaluation.scene import Scene
 from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.geometry.winding import libigl
 
 POSES = {"random": "uniform", "given": "upright"}  # --target-pose, in the words of `place_pair`
 
@@ -50,9 +51,10 @@ class TaskScene:
         """
         motion = np.asarray(Trajectory(object_motion[None]).matrices[0], float)
         try:
-            placed = judge(self.placement.pair, self.placement.placed(motion))
-        except InputError:  # libigl is not installed; the extra "mesh" has it
+            libigl("tdf imitate")
+        except InputError:  # the extra "mesh" has it
             return not_judged()
+        placed = judge(self.placement.pair, self.placement.placed(motion))
         return dataclasses.asdict(placed) | {"success": placed.holds()}
 
 
@@ -106,4 +108,6 @@ def _fitting(shown: Pair, seed: int) -> Pair:
         found = RELATIONS[shown.task].seat(one, shown.target)
         if found is not None:
             return Pair(shown.task, number, one, shown.target, *found, number - 1)
-    raise AssertionError(f"no {shown.task} object fits the target in {MOST_DRAWS} draws")
+    raise InputError(
+        f"tdf imitate: no object fits the demonstrated target in {MOST_DRAWS} draws; choose another --seed"
+    )

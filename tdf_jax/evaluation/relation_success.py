@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
-from tdf_jax.evaluation.relation_tasks import Pair
+from tdf_jax.evaluation.relation_tasks import Pair, moved
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.geometry.winding import libigl
@@ -169,13 +169,3 @@ def _crosses(mug: Mug, line: Float[np.ndarray, "2 3"]) -> bool:
     corners = mug.finger_hole - [x, z]
     angles = np.unwrap(np.arctan2(*np.concatenate([corners, corners[:1]]).T))
     return bool(abs(angles[-1] - angles[0]) > np.pi)  # once around, or not at all
-
-
-def moved(points: Float[np.ndarray, "points 3"], T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "points 3"]:
-    """Points after a motion.
-
-    Args:
-        points: points, (points, 3), metres.
-        T: motion, 4x4.
-    """
-    return points @ T[:3, :3].T + T[:3, 3]

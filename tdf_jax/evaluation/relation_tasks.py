@@ -13,6 +13,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, SEED_SPACE
 from tdf_jax.evaluation.conditions import CONDITIONS, SCALES, observed
 from tdf_jax.geometry import se3
@@ -116,7 +117,7 @@ def draw_pair(task: str, seed: int, number: int) -> Pair:
         number: number of the pair.
 
     Raises:
-        InputError: there is no such task.
+        InputError: there is no such task, or no pair of the seed fits.
     """
     checks.choice("draw_pair()", "task", task, RELATIONS)
     relation = RELATIONS[task]
@@ -132,7 +133,7 @@ def draw_pair(task: str, seed: int, number: int) -> Pair:
         found = relation.seat(one, target)
         if found is not None:
             return Pair(task, number, one, target, *found, redrawn)
-    raise AssertionError(f"no {task} pair fits in {MOST_DRAWS} draws")
+    raise InputError(f"draw_pair(): no {task} pair fits in {MOST_DRAWS} draws of seed {seed}; choose another seed")
 
 
 def place_pair(pair: Pair, seed: int, poses: str = "upright", clouds: str = "full", points: int = 1500) -> Placement:
@@ -155,7 +156,7 @@ def place_pair(pair: Pair, seed: int, poses: str = "upright", clouds: str = "ful
     T_world_object, T_world_target = (_random_pose(poses, rng, x) for x in (APART, -APART))
     seen = np.random.default_rng([SEED_SPACE, seed, pair.number, 5])
     points_object, points_target = (
-        _moved(observed(one.mesh, clouds, sample_surface(one.mesh, points, seen), seen), T).astype(np.float32)
+        moved(observed(one.mesh, clouds, sample_surface(one.mesh, points, seen), seen), T).astype(np.float32)
         for one, T in ((pair.object, T_world_object), (pair.target, T_world_target))
     )
     return Placement(pair, poses, clouds, points_object, points_target, T_world_object, T_world_target)
@@ -187,11 +188,11 @@ def demonstrate(pair: Pair, seed: int, points: int = 1500) -> Demonstration:
         path = lift_over(NUM_POSES, grasp[:3, 3], release[:3, 3], height=height, **ends)
     key = jax.random.key(0)
     return Demonstration(
-        points=_moved(sample_surface(one.mesh, points, rng), T_world_object).astype(np.float32),
+        points=moved(sample_surface(one.mesh, points, rng), T_world_object).astype(np.float32),
         trajectory=path,
         query=box_query(key, QUERIES, QUERY_SIZE),
         target=Target(
-            points=_moved(sample_surface(target.mesh, points, rng), T_world_target).astype(np.float32),
+            points=moved(sample_surface(target.mesh, points, rng), T_world_target).astype(np.float32),
             query=box_query(jax.random.fold_in(key, 1), CONTACT_QUERIES, CONTACT_SIZE),
             T_world_contact=np.asarray(se3.pose(T_world_contact[:3, :3], T_world_contact[:3, 3])),
         ),
@@ -216,7 +217,7 @@ def _buried(one: Shape, other: Shape, T_other_one, count: int) -> bool:
     points, faces = trimesh.sample.sample_surface(one.mesh, count, seed=0)[:2]
     points = np.concatenate([points, one.mesh.vertices])
     normals = np.concatenate([one.mesh.face_normals[faces], one.mesh.vertex_normals])
-    return bool(other.contains(_moved(points - DEEPEST * normals, T_other_one)).any())  # so that surfaces may touch
+    return bool(other.contains(moved(points - DEEPEST * normals, T_other_one)).any())  # so that surfaces may touch
 
 
 def _natural(category: str, rng: np.random.Generator) -> Shape:
@@ -273,7 +274,7 @@ def _mug_on_rack(mug: Shape, rack: Shape) -> tuple[np.ndarray, np.ndarray] | Non
         contact[:3, 3] += (length / 2 - distance) * seat[:3, 0]
         T_target_object[:3, 3] = contact[:3, 3] - T_target_object[:3, :3] @ handle
         hanging = _lowered(mug, rack, T_target_object, seat[:3, 2])
-        if hanging is not None and (_moved(mug.mesh.vertices, hanging)[:, 2] > rack.mesh.bounds[0, 2]).all():
+        if hanging is not None and (moved(mug.mesh.vertices, hanging)[:, 2] > rack.mesh.bounds[0, 2]).all():
             return hanging, contact
     return None
 
@@ -294,7 +295,16 @@ def _lowered(
     return raised
 
 
-def _moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
+def moved(points: Float[np.ndarray, "points 3"], T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "points 3"]:
+    """Points after a motion.
+
+    Args:
+        points: points, (points, 3), metres.
+        T: motion, 4x4.
+
+    Returns:
+        The moved points, (points, 3).
+    """
     return points @ T[:3, :3].T + T[:3, 3]
 
 

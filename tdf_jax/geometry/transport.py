@@ -136,8 +136,8 @@ def arrival_of(demonstration: Demonstration) -> Arrival:
 
     Returns:
         The arrival. Its length is that of the last part of the path on which the clouds of the object and its target
-            are within `NEAR`, and `BEYOND`, at least `ARRIVAL`. If an array is traced the depth is infinite, so that no
-            target is deeper.
+            are at most `NEAR` apart, plus `BEYOND`; at least `ARRIVAL`. If an array is traced, the length is `ARRIVAL`
+            and the depth is infinite, so that no target is deeper.
     """
     from scipy.spatial import KDTree
 

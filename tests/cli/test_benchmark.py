@@ -545,7 +545,8 @@ def test_relations_are_measured_and_reported(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--methods", "magic"), "--methods is 'magic'; expected one of tdf_jax"),
+        (("--methods", "magic", "all"), "--methods is 'magic'; expected one of tdf_jax"),
+        (("--weights", "bowl"), "--weights is not for --relations; expected one without the other"),
         (("--clouds", "half"), "--clouds is 'half'; expected no condition of size with --relations"),
         (("--demonstrations", "3"), "--demonstrations is 3; expected one of 1, 10"),
         (("--pairs", "0"), "--pairs is 0"),
@@ -559,3 +560,10 @@ def test_bad_relations_are_refused(words, message, tmp_path, capsys):
         run("--relations", *words, "--out", tmp_path / "out")
     assert ended.value.code == 2 and message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_options_of_relations_need_the_word(tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        run("--pose", "upright", "--out", tmp_path / "out")
+    assert ended.value.code == 2
+    assert "--pose is for --relations; expected one without the other; drop --pose, or add" in capsys.readouterr().err

@@ -71,8 +71,8 @@ def test_defaults_of_a_task(shipped):
     (("--method", "gauss-newton", "--k", "0.1"), "--method is gauss-newton and --task"),
     (("--goal-offset", "0", "0", "0.1"), "--goal-offset is (0.0, 0.0, 0.1) and --task"),
     (("--target", "known", "--target-weights", "mug"), "--target-weights is mug and --target is known; expected none"),
-    (("--scale", "0.01"), "--scale is for a --target file"),
-    (("--drop-invalid",), "--drop-invalid is for a --target file"),
+    (("--scale", "0.01"), "--scale is for a file"),
+    (("--drop-invalid",), "--drop-invalid is for a file"),
     (("--k", "0.02"), "--k is a weight of eq. 3"),
     (("--iterations", "5"), "--iterations is for --method adam"),
     (("--num-starts", "0"), "--num-starts is 0"),
@@ -130,7 +130,7 @@ def test_without_libigl_nothing_is_judged(made, monkeypatch):
     def missing(_):
         raise InputError("libigl is missing")
 
-    monkeypatch.setattr("tdf_jax.evaluation.relation_success.libigl", missing)
+    monkeypatch.setattr("tdf_jax.cli.tasks.libigl", missing)
     assert made.judged(jnp.asarray(pose(made.placement.motion))) == dict.fromkeys(JUDGED)
 
 
