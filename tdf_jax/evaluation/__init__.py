@@ -23,6 +23,7 @@ Modules:
     records: header of JSON records
     relation_report: page and record of `tdf benchmark --relations`
     relation_scores: placements of every method on every pair, and their verdicts
+    relation_study: the touch by occupancies and the path to a target, measured at the truth
     relation_success: gap, penetration, orientation and support of a placed object
     relation_tasks: an object and a target that fit, the true placement, a demonstration
     scene: a demonstration and a target in one world

@@ -7,9 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tdf_jax._internal.errors import InputError
+from tdf_jax.evaluation import relation_study
 from tdf_jax.evaluation.relation_success import judge
 from tdf_jax.evaluation.relation_tasks import RELATIONS, demonstrate, draw_pair, place_pair
 from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.networks.checkpoint import load_model
 
 SLOW = pytest.mark.slow
 TASKS = ["bottle_in_container", "mug_on_rack", pytest.param("bowl_on_mug", marks=SLOW)]
@@ -102,3 +104,16 @@ def test_pairs_are_drawn_by_seed_and_number():
     for word in ("poses", "clouds"):
         with pytest.raises(InputError, match=f"{word} is 'half'"):
             place_pair(first, 0, **{word: "half"})
+
+
+@pytest.mark.slow
+def test_parts_of_the_method_are_measured_at_the_truth(capsys):
+    relation_study.main(["paths", "--pairs", "1"])
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 3 * 2 * 4
+    assert all("off by 0 degrees" in line for line in lines if ", even:" not in line)
+    found = relation_study.touches("bowl_on_mug", load_model("bowl"), load_model("mug"), "full", 2)
+    assert found.shape == (2,) and np.abs(found).max() < 0.003
+    with pytest.raises(SystemExit):
+        relation_study.main(["paths", "--pairs", "0"])
+    assert "--pairs is 0; expected at least 1" in capsys.readouterr().err

@@ -1,0 +1,163 @@
+"""Parts of the placement on a target, each measured at the truth: the touch by occupancies, and the path between.
+
+python -m tdf_jax.evaluation.relation_study touch --pairs 20
+python -m tdf_jax.evaluation.relation_study paths --pairs 20
+"""
+
+import argparse
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from tdf_jax.energy.seating import touch_distance
+from tdf_jax.evaluation.relation_success import signed_distances
+from tdf_jax.evaluation.relation_tasks import RELATIONS, demonstrate, draw_pair, moved, place_pair
+from tdf_jax.geometry import se3
+from tdf_jax.geometry.trajectory import Trajectory, resample
+from tdf_jax.geometry.transport import ARRIVAL, arrival_depth, arrival_of, carry_to_target, carry_trajectory
+from tdf_jax.networks.checkpoint import load_model
+from tdf_jax.networks.encoding import encode
+from tdf_jax.networks.model import Model
+
+SEED = 300  # a development seed
+FIRST_DEMONSTRATION = 1000  # pairs from here on demonstrate
+INSIDE = 0.002  # metres inside the target at which a path counts as colliding
+NEAR = 0.02  # metres around the target's box within which points of the object are measured
+LAST = 0.03  # metres at the end of a path whose direction is compared
+POSES = 60  # of each path
+POINTS = 800  # corners of the object's mesh that are carried
+BEFORE = 5  # first poses that are left out: the object is still where it lay
+
+
+def touches(
+    task: str, object_model: Model, target_model: Model | None, clouds: str, pairs: int, seed: int = SEED
+) -> Float[np.ndarray, " pairs"]:
+    """How far down true placements touch by occupancies, metres; 0 would be exact.
+
+    Args:
+        task: name of the task.
+        object_model: network of the object.
+        target_model: network of the target; None to use the object's occupancy alone.
+        clouds: condition of both clouds.
+        pairs: number of pairs.
+        seed: seed of the pairs.
+
+    Returns:
+        The displacements, (pairs,); NaN where the two do not touch within reach.
+    """
+    found = []
+    for number in range(pairs):
+        placement = place_pair(draw_pair(task, seed, number), seed, "upright", clouds)
+        target = None if target_model is None else encode(target_model, placement.target_points)
+        field = encode(object_model, placement.points)
+        down = -placement.T_world_target[:3, 2]
+        motion = _pose(placement.motion)
+        found.append(touch_distance(field, target, placement.points, placement.target_points, motion, down))
+    return np.array(found)
+
+
+def paths(task: str, poses: str, number: int, seed: int = SEED) -> dict[str, tuple[float, float]]:
+    """Least distance to the target, and error of the approach, of paths to the true pick and goal of a pair.
+
+    Args:
+        task: name of the task.
+        poses: poses of both objects.
+        number: number of the pair.
+        seed: seed of the pairs.
+
+    Returns:
+        By the name of the warping: the smallest signed distance of the carried object from the target's surface along
+            the path, metres, at most `NEAR`; and the angle between the last `LAST` of the path and the demonstrated
+            approach, degrees.
+    """
+    demonstration = demonstrate(draw_pair(task, seed, FIRST_DEMONSTRATION + number), 0)
+    pair = draw_pair(task, seed, number)
+    placement = place_pair(pair, seed, poses)
+    target = demonstration.target
+    assert target is not None
+    grasp = pair.object.frames[RELATIONS[task].grasp]
+    pick = placement.T_world_object @ grasp
+    goal = placement.T_world_target @ pair.T_target_object @ grasp
+    T_world_contact = np.asarray(Trajectory(jnp.asarray(target.T_world_contact)[None]).matrices[0], float)
+    moves = placement.T_world_target @ pair.T_target_contact @ np.linalg.inv(T_world_contact)
+    path, arrival = resample(demonstration.trajectory, POSES), arrival_of(demonstration)
+    released = moved(placement.points.astype(float), placement.motion)
+    depth = arrival_depth(released, placement.target_points.astype(float), moves[:3, :3] @ arrival.outward)
+    ends = path, _pose(pick), _pose(goal)
+    warped = {
+        "even": carry_trajectory(*ends),
+        f"arrival of {100 * ARRIVAL:.0f} cm": carry_to_target(*ends, _pose(moves)),
+        "arrival as demonstrated": carry_to_target(*ends, _pose(moves), arrival=arrival.length),
+        "stretched by depth": carry_to_target(
+            *ends, _pose(moves), arrival=arrival.length, deeper=max(0.0, depth - arrival.depth)
+        ),
+    }
+    approach = -pair.T_target_contact[:3, 0] if task == "mug_on_rack" else np.array([0.0, 0.0, -1.0])
+    corners = pair.object.mesh.vertices[:: max(1, len(pair.object.mesh.vertices) // POINTS)]
+    measured = {}
+    for name, one in warped.items():
+        T_target_object = np.linalg.inv(placement.T_world_target) @ np.asarray(one.matrices, float)
+        T_target_object = T_target_object @ np.linalg.inv(grasp)
+        least = min(_clearance(pair.target, moved(corners, T)) for T in T_target_object[BEFORE:-1])
+        measured[name] = least, _angle(T_target_object[:, :3, 3], approach)
+    return measured
+
+
+def _clearance(target, points) -> float:
+    low, high = target.mesh.bounds
+    near = points[((points > low - NEAR) & (points < high + NEAR)).all(axis=1)]
+    return min(NEAR, float(signed_distances(target, near)[0].min())) if len(near) else NEAR
+
+
+def _angle(places, approach) -> float:
+    """Angle between the last part of a path and a direction, degrees."""
+    left = np.cumsum(np.linalg.norm(np.diff(places[::-1], axis=0), axis=1))
+    last = places[-1] - places[-2 - min(int(np.searchsorted(left, LAST)), len(places) - 2)]
+    return float(np.degrees(np.arccos(np.clip(last @ approach / np.linalg.norm(last), -1, 1))))
+
+
+def _pose(T: Float[np.ndarray, "4 4"]) -> Float[Array, "7"]:
+    return jnp.asarray(se3.pose(jnp.asarray(T[:3, :3], jnp.float32), jnp.asarray(T[:3, 3], jnp.float32)))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure one part, and print it.
+
+    Args:
+        arguments: words of the command line; by default those of the process.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m tdf_jax.evaluation.relation_study", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument("part", choices=("touch", "paths"), help="what is measured")
+    parser.add_argument("--pairs", type=int, default=20, help="number of pairs of each row (default: 20)")
+    settings = parser.parse_args(arguments)
+    if settings.pairs < 1:
+        parser.error(f"--pairs is {settings.pairs}; expected at least 1")
+    if settings.part == "touch":
+        bowl, mug = load_model("bowl"), load_model("mug")
+        rows = [("bowl_on_mug", bowl, mug, clouds) for clouds in ("full", "views4", "views1")]
+        for task, one, other, clouds in [*rows, ("mug_on_rack", mug, None, "full")]:
+            found = 1e3 * touches(task, one, other, clouds, settings.pairs)
+            print(
+                f"{task}, {clouds}: touch within 2 mm of {np.mean(np.abs(found) < 2):.0%}, median "
+                f"{np.nanmedian(found):.1f} mm, none of {np.isnan(found).sum()}",
+                flush=True,
+            )
+        return
+    for task in RELATIONS:
+        for poses in ("upright", "tilt60"):
+            every = [paths(task, poses, number) for number in range(settings.pairs)]
+            for name in every[0]:
+                least, angles = np.array([one[name] for one in every]).T
+                print(
+                    f"{task}, {poses}, {name}: inside the target on {np.mean(least < -INSIDE):.0%} of the paths, "
+                    f"approach off by {np.median(angles):.0f} degrees (median)",
+                    flush=True,
+                )
+
+
+if __name__ == "__main__":
+    main()
