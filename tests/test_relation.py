@@ -14,6 +14,7 @@ from tdf_jax.geometry import se3
 from tdf_jax.geometry.transport import BEYOND, NEAR, arrival_depth, arrival_of, carry_to_target
 
 KEY = jax.random.key(3)
+carried_path = jax.jit(carry_to_target)
 SEARCH = tdf.CarryConfig(num_starts=256, num_coarse_queries=8, coarse_steps=10, polish_steps=60)
 G_OBJECT, G_TARGET = (pose * [1, 1, 1, 1, 3, 3, 3] for pose in random_poses(21, 2))
 TARGET_CLOUD = random_cloud(8) * [1.2, 0.8, 1.0] + [0.05, 0.3, 0.0]
@@ -117,7 +118,7 @@ def test_a_path_repeats_the_motion_relative_to_the_object_and_then_to_the_target
     path = tdf.lift_over(60, (0.4, 0.0, 0.05), (0.0, 0.3, 0.2))
     poses = np.asarray(path.wxyz_xyz, np.float64)
     pick, goal, target_motion = random_poses(30, 3)
-    found = np.asarray(carry_to_target(path, jnp.asarray(pick), jnp.asarray(goal), jnp.asarray(target_motion)).wxyz_xyz)
+    found = np.asarray(carried_path(path, jnp.asarray(pick), jnp.asarray(goal), jnp.asarray(target_motion)).wxyz_xyz)
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(poses[:, 4:], axis=0), axis=1))])
     begin, end = length <= 0.05, length >= length[-1] - 0.08
     A = composed(pick, inverted(poses[0])[None])[0]
@@ -130,6 +131,7 @@ def test_a_path_repeats_the_motion_relative_to_the_object_and_then_to_the_target
     assert np.linalg.norm(np.diff(found[:, 4:], axis=0), axis=1).max() < 0.2  # no jump between them
 
 
+@pytest.mark.slow
 def test_a_target_that_moved_with_the_object_moves_the_whole_path():
     path = tdf.lift_over(20, (0.4, 0.0, 0.05), (0.0, 0.3, 0.2))
     G = random_poses(31, 1)[0]
@@ -224,7 +226,7 @@ def test_into_a_deeper_target_the_object_comes_from_farther_out():
     path = tdf.lift_over(60, (0.4, 0.0, 0.05), (0.0, 0.3, 0.2))
     pick, goal, target_motion = (jnp.asarray(pose) for pose in random_poses(30, 3))
     plain, deep = (
-        np.asarray(carry_to_target(path, pick, goal, target_motion, deeper=deeper).wxyz_xyz) for deeper in (0.0, 0.05)
+        np.asarray(carried_path(path, pick, goal, target_motion, deeper=deeper).wxyz_xyz) for deeper in (0.0, 0.05)
     )
     np.testing.assert_array_equal(plain[:, :4], deep[:, :4])
     np.testing.assert_array_equal(plain[[0, -1]], deep[[0, -1]])

@@ -101,6 +101,7 @@ def test_both_optimisers_are_exact(problem, monkeypatch, optimise, config, modul
     assert found == [{EXACT}]
 
 
+@pytest.mark.slow
 def test_training_is_as_fast_as_the_device_likes(small_model):
     clouds = np.stack([random_cloud(seed) for seed in range(2)])[None]
     shapes = (8, 3), (8,), (3,), (), (5, 3), (6, 5, 3)

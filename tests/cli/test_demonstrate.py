@@ -67,6 +67,7 @@ def test_the_file_is_imitated(files, weights, capsys):
     assert any(np.allclose(mode["pick"], poses[3], atol=1e-6) for mode in record["modes"])
 
 
+@pytest.mark.slow
 def test_the_goal_is_found_on_a_second_object(files, weights, capsys):
     motion = composed(POSES[6], inverse(POSES[3])[None])[0]
     released = carried(motion, CLOUD)

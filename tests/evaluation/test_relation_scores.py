@@ -77,6 +77,7 @@ def test_a_run_keeps_what_it_has_and_continues(small_model, tmp_path, monkeypatc
     assert set(METHODS) > {"ICP", "centroids"}
 
 
+@pytest.mark.slow
 def test_a_baseline_repeats_a_demonstration_of_the_same_objects(small_model, monkeypatch):
     """Test pair and demonstration are one, upright: the offset of the centroids is the truth up to the yaw."""
     monkeypatch.setattr(scores, "FIRST_DEMONSTRATION", 0)

@@ -134,6 +134,7 @@ def test_an_open_mesh_and_one_inside_out_have_the_sides_they_ought_to():
     np.testing.assert_allclose(distance(mesh_obstacle(sheet), above), 0.02, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_cloud_is_a_ball_about_every_point():
     points = random_cloud(0, 60)
     x = points[np.random.default_rng(1).integers(0, 60, 500)] + np.random.default_rng(2).uniform(-0.03, 0.03, (500, 3))

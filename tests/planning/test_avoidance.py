@@ -136,6 +136,7 @@ def test_several_obstacles_of_two_kinds_are_passed():
     assert_clear(cleared, LINE, scene)
 
 
+@pytest.mark.slow
 def test_a_body_that_touches_at_the_pick_leaves_by_the_shortest_ramp():
     """The cube stands on a table: near the pick the required distance is the length of the path from there."""
     table = box_obstacle((0, 0, -0.05), (0.3, 0.3, 0.1))
