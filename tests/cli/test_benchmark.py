@@ -138,6 +138,7 @@ def test_the_path_of_the_page_is_printed(folder, weights, capsys):
     assert capsys.readouterr().out == f"{folder / 'benchmark.md'}\n"
 
 
+@pytest.mark.slow
 def test_run_again_it_computes_nothing_and_writes_the_same(folder, weights, monkeypatch, tmp_path):
     shutil.copytree(folder, again := tmp_path / "again")
     monkeypatch.setattr("tdf_jax.evaluation.path_methods.Attempts.of", lambda *_: pytest.fail("computed again"))

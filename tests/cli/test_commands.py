@@ -658,6 +658,7 @@ def test_a_model_card_tells_what_the_record_does(evaluation):
         assert cells[-1].startswith(f"{100 * row['success_2cm_20deg']:.0f} %")
 
 
+@pytest.mark.slow
 def test_pictures_of_an_evaluation(weights, real, tmp_path, monkeypatch):
     drawn, triangle = [], np.array([[[0, 0, 0], [0.05, 0, 0], [0, 0.05, 0.01]]])
     monkeypatch.setattr(

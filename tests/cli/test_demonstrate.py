@@ -48,6 +48,7 @@ def test_the_box_may_have_three_edges_and_a_centre_and_poses_be_resampled(files)
     assert (demo.approach.num_poses, demo.transfer.num_poses, demo.retreat.num_poses) == (3, 6, 2)
 
 
+@pytest.mark.slow
 def test_the_file_is_imitated(files, weights, capsys):
     call(files)
     with_missing = np.insert(random_cloud(3), [5, 9, 20], (0, 0, 0), axis=0)

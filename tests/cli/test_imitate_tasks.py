@@ -100,6 +100,7 @@ def test_missing_weights_name_the_option(monkeypatch, task, needed, option):
     assert (given.weights, given.target_weights) == ("my.safetensors", "other.safetensors")
 
 
+@pytest.mark.slow
 def test_the_new_pair_is_another_and_the_true_motion_is_a_success(made):
     scene, placement, known = made.scene, made.placement, made.target_points is None
     shown = scene.demonstration.target.points
@@ -126,6 +127,7 @@ def test_given_poses_are_upright():
         np.testing.assert_allclose(T[:3, 2], [0, 0, 1], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_without_libigl_nothing_is_judged(made, monkeypatch):
     def missing(_):
         raise InputError("libigl is missing")
@@ -149,6 +151,7 @@ def perfect(made):
     )
 
 
+@pytest.mark.slow
 def test_the_record_and_the_table_judge_the_placement(made, weights, tmp_path, monkeypatch, capsys):
     target, solves = ("known", 2) if made.target_points is None else ("found", 3)
     result, calls = perfect(made), []

@@ -14,7 +14,7 @@ from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.networks.checkpoint import load_model
 
 SLOW = pytest.mark.slow
-TASKS = ["bottle_in_container", "mug_on_rack", pytest.param("bowl_on_mug", marks=SLOW)]
+TASKS = ["bottle_in_container", *(pytest.param(task, marks=SLOW) for task in ("mug_on_rack", "bowl_on_mug"))]
 
 
 @pytest.fixture(scope="module", params=TASKS)

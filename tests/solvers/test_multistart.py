@@ -240,6 +240,7 @@ def test_energies_are_those_of_the_trajectories_and_the_first_is_the_best(result
     assert (result.energies <= result.candidate_history[:, -1] + 1e-7).all()
 
 
+@pytest.mark.slow
 def test_the_history_of_a_start_begins_at_its_energy_and_ends_where_it_is_dropped(field, reference):
     """With all query points in every stage, energies of poses are those of the history."""
     one = dataclasses.replace(

@@ -90,11 +90,13 @@ def test_clouds_lie_where_the_motions_put_them(related, result, candidate):
     assert len(drawn(close_up, BEFORE)) == 0 and not close_up.lines
 
 
+@pytest.mark.slow
 def test_a_target_that_has_not_moved_is_on_both_sides(related, result):
     _, imitation, _, _ = relation_figure(related, NEW, result).axes
     close(drawn(imitation, TARGET), related.target.points)
 
 
+@pytest.mark.slow
 def test_what_has_no_target_or_candidate_is_refused(related, result):
     with pytest.raises(InputError, match=r"relation_figure\(\): the demonstration or the result has no target"):
         relation_figure(dataclasses.replace(related, target=None), NEW, result)
