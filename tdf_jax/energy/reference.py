@@ -58,8 +58,8 @@ class Contact:
         target_points: cloud of the demonstrated target, world frame, (target_points, 3).
         down: unit vector down (world -z) at the release, contact frame, (3,).
         touch: how far down the demonstrated object touches its target from its pose at the release, metres, see
-            `tdf_jax.energy.seating`; the median of several demonstrations. NaN if it does not touch from above, or is
-            not known.
+            `tdf_jax.energy.seating`; the median of several demonstrations. Infinite if it does not touch from above,
+            or is not known.
         arrival: length of the first demonstration's path before the release on which the object is near its target,
             metres, see `tdf_jax.geometry.transport.Arrival`.
         outward: direction from the released object to where its arrival begins, contact frame, (3,).
@@ -210,19 +210,17 @@ def _contact(demonstrations, fields, target_model, combine) -> Contact | None:
 
 
 def _touch(demonstrations, fields, target_fields) -> float:
-    """How far down the demonstrated objects touch their targets, the median; NaN if one does not, or is traced."""
+    """How far down the demonstrated objects touch their targets, the median; infinite if one does not or is traced."""
     scenes = list(zip(demonstrations, fields, target_fields, strict=True))
     if any(checks.traced(*jax.tree.leaves((demo.points, demo.target.points, field))) for demo, field, _ in scenes):
-        return np.nan
+        return np.inf
     down = np.array([0.0, 0.0, -1.0])
-    return float(
-        np.median(
-            [
-                touch_distance(field, target, demo.points, demo.target.points, demo.object_motion, down)
-                for demo, field, target in scenes
-            ]
-        )
-    )
+    distances = [
+        touch_distance(field, target, demo.points, demo.target.points, demo.object_motion, down)
+        for demo, field, target in scenes
+    ]
+    # Not NaN, which a caller who looks for NaN (jax_debug_nans) would take for an error.
+    return float(np.nan_to_num(np.median(distances), nan=np.inf))
 
 
 def _combined(several: list[Array], combine: str) -> Array:
