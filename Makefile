@@ -15,7 +15,7 @@ test: $(VENV)/.installed-test
 test-all: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -rs
 
-# Every annotation of these packages is checked as their functions run, shapes included.
+# Annotations of arguments and results of these packages are checked as their functions run, shapes included.
 TYPED := geometry io networks energy landscape shapes
 test-types: $(VENV)/.installed-dev
 	TDF_CHECK_TYPES="$(TYPED)" $(BIN)/python -m pytest -m "not slow" $(TYPED:%=tests/%)
