@@ -63,7 +63,8 @@ def imitate(
         points: point cloud of the new object, (points, 3), metres, world frame.
         target_points: point cloud of the new target, (points, 3), metres, world frame, if the demonstration has one.
             Without it the demonstrated target has not moved, and the object is placed there.
-        target_model: network of the targets; by default `model`.
+        target_model: network of the targets; by default `model`. A demonstrated target that has not moved needs none;
+            with one the object is seated by the fields of both.
         key: random key, such as `jax.random.key(0)`; the result is a function of it.
         goal: pose at the release, (7,), T_world_query as `wxyz_xyz`; by default, with `fix_last`, the demonstration's,
             moved by the centroids. Poses after the release follow it rigidly.
@@ -110,7 +111,7 @@ def imitate(
             )
     field = encode(model, points)
     if reference.contact is not None:
-        objects = Objects(points, target_points, field, target_field(model, target_points, target_model))
+        objects = Objects(points, target_points, field, target_field(model, reference, target_points, target_model))
         if target_points is not None:
             check_apart("imitate()", points, target_points)
         search = {"config": config, "seat": seat, "progress": progress, "device_mesh": device_mesh}

@@ -53,7 +53,8 @@ class Objects:
         target_points: cloud of the target, (points, 3), metres, world frame; None if the demonstrated one has not
             moved.
         field: field of the object in its initial pose.
-        target: field of the target; None if it has not moved.
+        target: field of the target; None to look for the contact region on the object alone and to seat it by the
+            object's field alone, which is possible if the demonstrated target has not moved.
     """
 
     points: Float[Array | np.ndarray, "points 3"]
@@ -109,7 +110,8 @@ def relate(
         points: point cloud of the new object in its initial pose, (points, 3), metres, world frame.
         target_points: point cloud of the new target, (points, 3), metres, world frame; None if the demonstrated target
             has not moved.
-        target_model: network of the target; by default `model`.
+        target_model: network of the target; by default `model` for a new target. A demonstrated target that has not
+            moved needs none, but with one the object is seated by the fields of both.
         key: random key; the result is a function of it.
         seat: lower or raise the object by up to 1.5 cm until it touches the target, if the demonstrated object touched
             its target from above; see `tdf_jax.energy.seating`.
@@ -125,7 +127,8 @@ def relate(
     checks.key("relate()", key)
     reference = reference_of("relate()", model, demonstration, target_points, target_model)
     checks.boolean("relate()", "seat", seat)
-    objects = Objects(points, target_points, encode(model, points), target_field(model, target_points, target_model))
+    field = target_field(model, reference, target_points, target_model)
+    objects = Objects(points, target_points, encode(model, points), field)
     return find_relations("relate()", objects, reference, key, config, seat).motions[0]
 
 
@@ -149,7 +152,7 @@ def reference_of(function: str, model: Model, demonstration, target_points, targ
     if isinstance(demonstration, Reference):
         reference = demonstration
     else:
-        side = None if target_points is None else model if target_model is None else target_model
+        side = target_model if target_points is None or target_model is not None else model
         reference = describe(model, demonstration, target_model=side)
     if reference.contact is None and (target_points is not None or target_model is not None):
         raise InputError(
@@ -163,19 +166,26 @@ def reference_of(function: str, model: Model, demonstration, target_points, targ
     return reference
 
 
-def target_field(model: Model, target_points, target_model: Model | None) -> DescriptorField | None:
-    """Field of the new target.
+def target_field(
+    model: Model, reference: Reference, target_points, target_model: Model | None
+) -> DescriptorField | None:
+    """Field of the target.
 
     Args:
         model: network of the object.
+        reference: the demonstration.
         target_points: point cloud of the new target, (points, 3), metres, world frame; None if the demonstrated one has
             not moved.
-        target_model: network of the target; by default `model`.
+        target_model: network of the target; by default `model` for a new target.
 
     Returns:
-        The field; None without a new target.
+        The field; None if the demonstrated target has not moved and there is no network for it.
     """
-    return None if target_points is None else encode(model if target_model is None else target_model, target_points)
+    if target_points is not None:
+        return encode(model if target_model is None else target_model, target_points)
+    if target_model is None or reference.contact is None:
+        return None
+    return encode(target_model, reference.contact.target_points)
 
 
 def find_relations(
@@ -219,10 +229,10 @@ def find_relations(
         config,
     )
     residual = np.nan
-    if objects.target is None:
+    if objects.target_points is None:
         on_target, target_energies = np.asarray(contact.T_world_contact)[None], np.zeros(1, object_energies.dtype)
     else:
-        if contact.target_descriptors is None or contact.T_target_contact is None:
+        if objects.target is None or contact.target_descriptors is None or contact.T_target_contact is None:
             raise InputError(f"{function}: the reference does not have the target's descriptors; see `describe`")
         on_target, target_energies = _distinct(
             function,

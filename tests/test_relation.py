@@ -102,6 +102,25 @@ def test_a_target_that_stands_where_it_stood_needs_no_cloud(small_model, related
     assert np.isnan(found.target_residual)
 
 
+def test_a_network_of_a_target_that_stands_where_it_stood_seats_the_object(small_model, related, moved, monkeypatch):
+    seen = []
+
+    def touch(field, target, *rest):
+        seen.append(target)
+        return 0.004
+
+    monkeypatch.setattr("tdf_jax.relation.touch_distance", touch)
+    reference = tdf.describe(small_model, related, target_model=small_model)
+    reference = dataclasses.replace(reference, contact=dataclasses.replace(reference.contact, touch=jnp.zeros(())))
+    options = {"points": moved[0], "key": KEY, "config": SEARCH}
+    alone = tdf.relate(small_model, reference, **options)
+    both = tdf.relate(small_model, reference, target_model=small_model, **options)
+    np.testing.assert_array_equal(alone, both)  # the contact region stays where it was
+    assert seen[0] is None
+    there = tdf.encode(small_model, related.target.points)
+    np.testing.assert_allclose(seen[-1].latent, there.latent, atol=1e-6)
+
+
 def test_a_shared_reference_gives_the_same(small_model, related, moved, result):
     reference = tdf.describe(small_model, related, target_model=small_model)
     again = tdf.imitate(small_model, reference, moved[0], target_points=moved[1], key=KEY, config=SEARCH)
