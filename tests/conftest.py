@@ -52,6 +52,16 @@ def _quick_compile_options(*sizes, env_options_overrides=None, **about):
 compiler.get_compile_options = _quick_compile_options
 
 
+def quick_environment() -> dict[str, str]:
+    """Environment of a started process that is to compile as quickly."""
+    flags = [f"--{name}={str(value).lower()}" for name, value in QUICK.items()]
+    return {
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+        "JAX_TRACEBACK_IN_LOCATIONS_LIMIT": "0",
+        "XLA_FLAGS": " ".join([os.environ.get("XLA_FLAGS", ""), *flags]).strip(),
+    }
+
+
 def pytest_runtest_setup(item):
     """Programs are compiled with few optimisations, but for parity and for what runs long."""
     long = item.get_closest_marker("slow") and "small_model" not in item.fixturenames

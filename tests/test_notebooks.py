@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from conftest import quick_environment
 
 FOLDER = Path(__file__).parent.parent / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
@@ -43,7 +44,7 @@ def test_runs_and_shows_a_picture(path, tmp_path, monkeypatch):
     monkeypatch.setenv("JUPYTER_RUNTIME_DIR", str(tmp_path))
     env = {name: value for name, value in os.environ.items() if name != "NDF_CHECKPOINT"}
     # Nearly all of the time is compilation, which is shorter so; see conftest.
-    env |= {"TDF_FAST": "1", "IPYTHONDIR": str(tmp_path), "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+    env |= {"TDF_FAST": "1", "IPYTHONDIR": str(tmp_path)} | quick_environment()
     notebook, before = nbformat.read(path, as_version=nbformat.NO_CONVERT), sorted(FOLDER.rglob("*"))
     nbformat.validate(notebook)
     client = NotebookClient(

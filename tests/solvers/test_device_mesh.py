@@ -6,12 +6,12 @@ import subprocess
 import sys
 
 import pytest
+from conftest import quick_environment
 
 # Argument 1 is the folder of conftest.py; with two more, the process is one of two and holds four of eight devices.
 SCRIPT = """
 import sys; sys.path.insert(0, sys.argv[1])
 import jax, jax.numpy as jnp, numpy as np
-jax.config.update('jax_disable_most_optimizations', True)
 several = len(sys.argv) > 2
 if several:
     jax.distributed.initialize(f'127.0.0.1:{sys.argv[2]}', num_processes=2, process_id=int(sys.argv[3]))
@@ -66,10 +66,8 @@ print('equal')
 def processes(tmp_path, devices, arguments):
     script = tmp_path / "devices.py"
     script.write_text(SCRIPT)
-    environment = os.environ | {
-        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
-        "JAX_PLATFORMS": "cpu",
-    }
+    environment = os.environ | quick_environment() | {"JAX_PLATFORMS": "cpu"}
+    environment["XLA_FLAGS"] += f" --xla_force_host_platform_device_count={devices}"
     command = [sys.executable, str(script), os.path.dirname(os.path.dirname(__file__))]
     running = [
         subprocess.Popen([*command, *more], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
