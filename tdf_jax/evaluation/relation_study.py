@@ -5,7 +5,9 @@ python -m tdf_jax.evaluation.relation_study paths --pairs 20
 """
 
 import argparse
+import functools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +15,7 @@ from jaxtyping import Array, Float
 
 from tdf_jax.energy.seating import touch_distance
 from tdf_jax.evaluation.relation_success import signed_distances
-from tdf_jax.evaluation.relation_tasks import RELATIONS, demonstrate, draw_pair, moved, place_pair
+from tdf_jax.evaluation.relation_tasks import POSES, RELATIONS, Placement, demonstrate, draw_pair, moved, place_pair
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.trajectory import Trajectory, resample
 from tdf_jax.geometry.transport import ARRIVAL, arrival_depth, arrival_of, carry_to_target, carry_trajectory
@@ -26,8 +28,11 @@ FIRST_DEMONSTRATION = 1000  # pairs from here on demonstrate
 INSIDE = 0.002  # metres inside the target at which a path counts as colliding
 NEAR = 0.02  # metres around the target's box within which points of the object are measured
 LAST = 0.03  # metres at the end of a path whose direction is compared
-POSES = 60  # of each path
+WAYPOINTS = 60  # of each path
 POINTS = 800  # corners of the object's mesh that are carried
+BESIDE = 0.15  # metres from where the object stood within which its support counts
+# Low and high corners of a gripper's hand in the frame of the place that it picks, metres; its fingers are below.
+HAND = (-0.04, -0.02, 0.02), (0.04, 0.02, 0.12)
 BEFORE = 5  # first poses that are left out: the object is still where it lay
 
 
@@ -58,8 +63,25 @@ def touches(
     return np.array(found)
 
 
-def paths(task: str, poses: str, number: int, seed: int = SEED) -> dict[str, tuple[float, float]]:
-    """Least distance to the target, and error of the approach, of paths to the true pick and goal of a pair.
+class Measured(NamedTuple):
+    """What a path does between the pick and the goal.
+
+    Attributes:
+        clearance: smallest signed distance of the carried object from the target's surface, metres, at most `NEAR`.
+        gripper: that of a gripper's box.
+        support: how far the carried object dips below the horizontal plane that it stood on, within `BESIDE` of where
+            it stood, metres.
+        approach: angle between the last `LAST` of the path and the demonstrated approach, degrees.
+    """
+
+    clearance: float
+    gripper: float
+    support: float
+    approach: float
+
+
+def paths(task: str, poses: str, number: int, seed: int = SEED) -> dict[str, Measured]:
+    """Clearances and the error of the approach of paths to the true pick and goal of a pair.
 
     Args:
         task: name of the task.
@@ -68,9 +90,7 @@ def paths(task: str, poses: str, number: int, seed: int = SEED) -> dict[str, tup
         seed: seed of the pairs.
 
     Returns:
-        By the name of the warping: the smallest signed distance of the carried object from the target's surface along
-            the path, metres, at most `NEAR`; and the angle between the last `LAST` of the path and the demonstrated
-            approach, degrees.
+        What is measured, by the name of the warping.
     """
     demonstration = demonstrate(draw_pair(task, seed, FIRST_DEMONSTRATION + number), 0)
     pair = draw_pair(task, seed, number)
@@ -82,27 +102,45 @@ def paths(task: str, poses: str, number: int, seed: int = SEED) -> dict[str, tup
     goal = placement.T_world_target @ pair.T_target_object @ grasp
     T_world_contact = np.asarray(Trajectory(jnp.asarray(target.T_world_contact)[None]).matrices[0], float)
     moves = placement.T_world_target @ pair.T_target_contact @ np.linalg.inv(T_world_contact)
-    path, arrival = resample(demonstration.trajectory, POSES), arrival_of(demonstration)
+    path, arrival = resample(demonstration.trajectory, WAYPOINTS), arrival_of(demonstration)
     released = moved(placement.points.astype(float), placement.motion)
     depth = arrival_depth(released, placement.target_points.astype(float), moves[:3, :3] @ arrival.outward)
     ends = path, _pose(pick), _pose(goal)
+    stretched = functools.partial(
+        carry_to_target, *ends, _pose(moves), arrival=arrival.length, deeper=max(0.0, depth - arrival.depth)
+    )
     warped = {
         "even": carry_trajectory(*ends),
         f"arrival of {100 * ARRIVAL:.0f} cm": carry_to_target(*ends, _pose(moves)),
         "arrival as demonstrated": carry_to_target(*ends, _pose(moves), arrival=arrival.length),
-        "stretched by depth": carry_to_target(
-            *ends, _pose(moves), arrival=arrival.length, deeper=max(0.0, depth - arrival.depth)
-        ),
+        "departure relative to the object": stretched(upright=False),
+        "departure upwards": stretched(),
     }
     approach = -pair.T_target_contact[:3, 0] if task == "mug_on_rack" else np.array([0.0, 0.0, -1.0])
     corners = pair.object.mesh.vertices[:: max(1, len(pair.object.mesh.vertices) // POINTS)]
-    measured = {}
-    for name, one in warped.items():
-        T_target_object = np.linalg.inv(placement.T_world_target) @ np.asarray(one.matrices, float)
-        T_target_object = T_target_object @ np.linalg.inv(grasp)
-        least = min(_clearance(pair.target, moved(corners, T)) for T in T_target_object[BEFORE:-1])
-        measured[name] = least, _angle(T_target_object[:, :3, 3], approach)
-    return measured
+    return {name: _measured(placement, grasp, one, corners, approach) for name, one in warped.items()}
+
+
+def _measured(placement: Placement, grasp, path: Trajectory, corners, approach) -> Measured:
+    T_world_gripper, target = np.asarray(path.matrices, float), placement.pair.target
+    T_world_object = T_world_gripper @ np.linalg.inv(grasp)
+    there = np.linalg.inv(placement.T_world_target)
+    object_points = np.stack([moved(corners, T) for T in T_world_object])
+    low, middle = object_points[0, :, 2].min(), object_points[0].mean(axis=0)
+    beside = np.linalg.norm(object_points[..., :2] - middle[:2], axis=2) < BESIDE
+    return Measured(
+        min(_clearance(target, moved(points, there)) for points in object_points[BEFORE:-1]),
+        min(_clearance(target, moved(_gripper_box(), there @ T)) for T in T_world_gripper[BEFORE:-1]),
+        float(low - object_points[..., 2][beside].min()),
+        _angle((there @ T_world_object)[:, :3, 3], approach),
+    )
+
+
+def _gripper_box() -> Float[np.ndarray, "points 3"]:
+    """Points on the surface of a gripper's hand, above the place that it picks, in the frame of that place."""
+    sides = [np.linspace(low, high, 9) for low, high in zip(*HAND)]
+    grid = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3)
+    return grid[(np.isclose(grid, HAND[0]) | np.isclose(grid, HAND[1])).any(axis=1)]
 
 
 def _clearance(target, points) -> float:
@@ -148,13 +186,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
             )
         return
     for task in RELATIONS:
-        for poses in ("upright", "tilt60"):
+        for poses in POSES:
             every = [paths(task, poses, number) for number in range(settings.pairs)]
             for name in every[0]:
-                least, angles = np.array([one[name] for one in every]).T
+                clearance, gripper, support, approach = np.array([one[name] for one in every]).T
                 print(
-                    f"{task}, {poses}, {name}: inside the target on {np.mean(least < -INSIDE):.0%} of the paths, "
-                    f"approach off by {np.median(angles):.0f} degrees (median)",
+                    f"{task}, {poses}, {name}: inside the target on {np.mean(clearance < -INSIDE):.0%} of the paths, "
+                    f"the gripper on {np.mean(gripper < -INSIDE):.0%}, below the support on "
+                    f"{np.mean(support > INSIDE):.0%}, approach off by {np.median(approach):.0f} degrees (median)",
                     flush=True,
                 )
 

@@ -67,14 +67,15 @@ def carry_to_target(
     departure: float = DEPARTURE,
     arrival: float | Float[Array, ""] = ARRIVAL,
     deeper: float | Float[Array, ""] = 0.0,
+    upright: bool = True,
 ) -> Trajectory:
     """Warp a demonstrated path between a pick and a goal at a target, repeating the demonstrated motion at both ends.
 
     Near the pick, the gripper repeats its motion relative to the object: pose T_i becomes A T_i, where A takes the
-    first pose to the pick. Near the goal, the object repeats its motion relative to the target: with the motion
-    D_i = T_i inverse(T_0) of the object, D = D_n and the motion B of the target, pose i becomes
-    B D_i inverse(D) inverse(B) times the goal. Between them the two are blended by the length of the path, with the
-    SO(3) geodesic and a smooth step.
+    first pose to the pick; but what was lifted up is lifted up, however the object lies (`upright`). Near the goal,
+    the object repeats its motion relative to the target: with the motion D_i = T_i inverse(T_0) of the object, D = D_n
+    and the motion B of the target, pose i becomes B D_i inverse(D) inverse(B) times the goal. Between them the two are
+    blended by the length of the path, with the SO(3) geodesic and a smooth step.
 
     Args:
         demonstrated: demonstrated path from the grasp to the release, T_world_query.
@@ -87,13 +88,20 @@ def carry_to_target(
             take at most 80 % of the path; otherwise both are shortened in proportion.
         deeper: how much farther than demonstrated the object arrives from, metres: the arrival is stretched along the
             line from its end to its begin, as into a container that is deeper than the demonstrated one.
+        upright: turn the demonstrated displacement after the pick by A's rotation about the world's z axis only, so
+            that an object that was lifted from its support is lifted from it; False to turn it by all of A's rotation,
+            so that the object moves in the same direction of its own.
 
     Returns:
         The warped path, T_world_query, with as many poses.
     """
     poses = jnp.asarray(demonstrated.wxyz_xyz)
-    pick_motion = se3.compose(jnp.asarray(pick), se3.inverse(poses[0]))
+    pick = jnp.asarray(pick)
+    pick_motion = se3.compose(pick, se3.inverse(poses[0]))
     leaving = se3.compose(pick_motion, poses)
+    if upright:
+        displacements = poses[:, 4:] - poses[0, 4:]
+        leaving = leaving.at[:, 4:].set(pick[4:] + displacements @ _about_vertical(pick_motion).T)
     relative = se3.compose(poses, se3.inverse(poses[-1]))  # D_i inverse(D)
     at_target = se3.compose(se3.compose(jnp.asarray(target_motion), relative), se3.inverse(jnp.asarray(target_motion)))
     arriving = se3.compose(at_target, jnp.asarray(goal))
@@ -111,6 +119,15 @@ def carry_to_target(
     R = se3.geodesic(se3.rotation(leaving), se3.rotation(arriving), s)
     t = (1 - s)[:, None] * leaving[:, 4:] + s[:, None] * arriving[:, 4:]
     return Trajectory(se3.pose(R, t))
+
+
+def _about_vertical(motion) -> Array:
+    """The part of a rotation that is about the z axis, (3, 3); none if the motion turns z upside down exactly."""
+    w, z = motion[0], motion[3]
+    size = jnp.hypot(w, z)
+    w, z = jnp.where(size > 1e-6, w, 1.0), jnp.where(size > 1e-6, z, 0.0)
+    twist = jnp.stack([w, jnp.zeros_like(w), jnp.zeros_like(w), z]) / jnp.hypot(w, z)
+    return se3.rotation(jnp.concatenate([twist, jnp.zeros(3, twist.dtype)]))
 
 
 @dataclasses.dataclass(frozen=True)
