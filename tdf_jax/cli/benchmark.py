@@ -209,6 +209,34 @@ def _relations(out: Path, settings: dict) -> None:
     write_record("tdf benchmark", out / RELATIONS_RECORD, record(scores, networks, settings, redrawn), indent=None)
     replace_file("tdf benchmark", out / RELATIONS_PAGE, page(scores, settings, redrawn).encode())
     print(out / RELATIONS_PAGE)
+    _draw_failures(out, scores, settings["seed"])
+
+
+def _draw_failures(out: Path, scores, seed: int) -> None:
+    from tdf_jax.cli.pictures import Pictures
+    from tdf_jax.evaluation.relation_report import failures, picture
+    from tdf_jax.evaluation.relation_tasks import draw_pair, place_pair
+
+    pictures = Pictures("tdf benchmark")
+    for task in dict.fromkeys(one.condition.task for one in scores):
+        failed = failures(scores, task)
+        if not failed:
+            (out / picture(task)).unlink(missing_ok=True)  # that of an earlier run with fewer pairs
+            continue
+        with pictures.drawing(out / picture(task)) as path:
+            from tdf_jax.viz.placements import PlacedMeshes, placements_figure
+            from tdf_jax.viz.style import save_figure
+
+            drawn = []
+            for one in failed:
+                pair = draw_pair(task, seed, one.number)
+                placement = place_pair(pair, seed, one.condition.poses, one.condition.clouds)
+                lengths = f"gap {1e3 * one.placed.gap:.0f} mm, overlap {1e3 * one.placed.penetration:.0f} mm"
+                title = f"{one.condition.poses}, {one.condition.clouds}, pair {one.number}\n{lengths}"
+                found, frames = placement.placed(one.motion), (pair.T_target_object, pair.T_target_contact)
+                drawn.append(PlacedMeshes(title, pair.object.mesh, pair.target.mesh, found, *frames))
+            save_figure(path, placements_figure(drawn))
+    pictures.check()
 
 
 def _makers(pairs, seed, height, clouds, targets, num_poses) -> list[Callable]:

@@ -18,6 +18,7 @@ PUBLISHED = {
     "mug_on_rack": {"upright": 0.84, "tilt60": 0.75},
     "bottle_in_container": {"upright": 0.80, "tilt60": 0.75},
 }
+MOST_FAILURES = 5  # that are drawn of each task
 HEADS = (
     "poses", "clouds", "demonstrations", "method", "pairs", "success", "within 5 mm", "gap", "penetration", "upright",
     "supported", "R-NDF", "seconds",
@@ -113,7 +114,29 @@ def page(scores: Sequence[Score], settings: Mapping[str, Any], redrawn: Mapping[
             f"{one['clouds']}: {', '.join(percent(share) for share in one['success_of_each_demonstration'])}."
             for one in spread
         ]
+        if failures(scores, task):
+            parts.append(f"![The first failures, cut open, above the right placements]({picture(task)})")
     return "\n\n".join(parts) + "\n"
+
+
+def failures(scores: Sequence[Score], task: str) -> list[Score]:
+    """The first failures of the library at a task, at most `MOST_FAILURES`; those that `picture` of the task shows.
+
+    Args:
+        scores: all placements.
+        task: name of the task.
+    """
+    mine = [one for one in scores if one.condition.task == task and one.method == LIBRARY]
+    return [one for one in mine if not one.placed.holds()][:MOST_FAILURES]
+
+
+def picture(task: str) -> str:
+    """Name of the picture of a task's failures.
+
+    Args:
+        task: name of the task.
+    """
+    return f"failures_{task}.png"
 
 
 def _setup(settings, redrawn) -> str:

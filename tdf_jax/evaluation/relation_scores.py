@@ -75,6 +75,7 @@ class Score:
         demonstrated: number of the demonstration, or -1 where all are used.
         placed: the verdict.
         seconds: time of the placement, both encodings included; the first of a run compiles.
+        motion: motion M of the object, 4x4, metres, world frame.
     """
 
     method: str
@@ -83,6 +84,7 @@ class Score:
     demonstrated: int
     placed: Placed
     seconds: float
+    motion: Float[np.ndarray, "4 4"]
 
 
 def run(
@@ -125,7 +127,8 @@ def run(
                 about = [FORMAT, version("tdf_jax"), jax.default_backend(), *names, *condition, number, shown, seed]
                 result = kept("tdf benchmark", folder, [*about, method], functools.partial(attempts.of, method))
                 verdict = Placed(**{field.name: result[field.name].item() for field in dataclasses.fields(Placed)})
-                yield Score(method, condition, number, shown, verdict, float(result["seconds"]))
+                motion = np.asarray(result["motion"], float)
+                yield Score(method, condition, number, shown, verdict, float(result["seconds"]), motion)
             bar.update()
     bar.close()
 

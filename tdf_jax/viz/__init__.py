@@ -9,6 +9,7 @@ Modules:
     imitation: an imitation and its losses
     landscapes: energy landscapes
     paper: the paper's figures
+    placements: placed objects, cut open
     polygons3d: solids in 3-D axes
     reconstruction: surfaces and transfers
     relations: an object placed on a target

@@ -538,6 +538,7 @@ def test_relations_are_measured_and_reported(tmp_path, capsys):
     assert capsys.readouterr().out.strip() == str(tmp_path / "relations.md")
     text = (tmp_path / "relations.md").read_text()
     assert "## Bottle in container" in text and text.count("| centroids | 2 |") == 2
+    assert "failures_" not in text and not list(tmp_path.glob("*.png"))  # those of the library are drawn
     found = json.loads((tmp_path / "relations.json").read_text())
     assert found["weights"] == {"bottle_in_container": ["bottle", "multi"]} and len(found["placements"]) == 4
     assert [row["poses"] for row in found["rows"]] == ["upright", "tilt60"]

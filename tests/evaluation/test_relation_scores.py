@@ -29,7 +29,7 @@ def test_every_part_of_the_verdict_counts(reason):
 
 
 def canned(placed, method=LIBRARY):
-    return [Score(method, BOTTLE, i, i * 10 // len(placed), one, 2.0) for i, one in enumerate(placed)]
+    return [Score(method, BOTTLE, i, i * 10 // len(placed), one, 2.0, np.eye(4)) for i, one in enumerate(placed)]
 
 
 def test_rates_intervals_and_the_spread_over_demonstrations():
