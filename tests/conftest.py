@@ -63,11 +63,9 @@ def quick_environment() -> dict[str, str]:
 
 
 def pytest_runtest_setup(item):
-    """Programs are compiled with few optimisations, but for parity and for what runs long."""
-    long = item.get_closest_marker("slow") and "small_model" not in item.fixturenames
-    parity = "golden" in item.fixturenames
-    quick = "quick_compilation" in item.fixturenames or not (long or parity)
-    jax.config.update("jax_disable_most_optimizations", quick)
+    """Programs are compiled with few optimisations, but for the fast tests of parity, which are of what users run."""
+    parity = "golden" in item.fixturenames and not item.get_closest_marker("slow")
+    jax.config.update("jax_disable_most_optimizations", "quick_compilation" in item.fixturenames or not parity)
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import POSES, QUERIES, STARTS
+from conftest import POSES, QUERIES, STARTS, quick_environment
 from tqdm import tqdm
 
 import tdf_jax as tdf
@@ -368,6 +368,7 @@ def test_a_warning_beside_a_progress_bar_has_its_own_line(command, capsys):
 def tdf_process(*words, **options):
     code = "from tdf_jax.cli.main import main; main()"
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | options
+    options["env"] = options.get("env", os.environ) | quick_environment()
     return subprocess.Popen([sys.executable, "-c", code, *map(str, words)], cwd=PACKAGE.parent, **options)
 
 

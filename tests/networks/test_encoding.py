@@ -33,19 +33,20 @@ def test_a_cloud_is_centred_before_it_is_rounded(small_model):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shift", [(200.0, -150.0, 100.0), (240.0, 240.0, -240.0)])
-def test_a_pick_far_from_the_origin_is_exact_to_a_tenth_of_a_millimetre(shift):
+def test_a_pick_far_from_the_origin_is_exact_to_a_tenth_of_a_millimetre():
+    """Nearly as far as is allowed, in every coordinate."""
+    shift, config = (240.0, 200.0, -240.0), tdf.CarryConfig(num_starts=16, num_candidates=2)
     case = generated_case("mug", 3, 0)
-    demonstration = place_demonstration(case, "wave", 3, tdf.box_query(jax.random.key(1), 64, 0.06))
+    demonstration = place_demonstration(case, "wave", 3, tdf.box_query(jax.random.key(1), 32, 0.06))
     model, key, offset = tdf.load_model("mug"), jax.random.key(0), np.array([0, 0, 0, 0, *shift])
     far = dataclasses.replace(
         demonstration,
         points=np.asarray(demonstration.points, np.float64) + shift,
         trajectory=tdf.Trajectory(np.asarray(demonstration.trajectory.wxyz_xyz, np.float64) + offset),
     )
-    expected = tdf.imitate(model, demonstration, case.points_b, key=key).trajectory.wxyz_xyz
+    expected = tdf.imitate(model, demonstration, case.points_b, key=key, config=config).trajectory.wxyz_xyz
     points = np.asarray(case.points_b, np.float64) + np.array(shift)
-    found = np.asarray(tdf.imitate(model, far, points, key=key).trajectory.wxyz_xyz, np.float64) - offset
+    found = np.asarray(tdf.imitate(model, far, points, key=key, config=config).trajectory.wxyz_xyz, np.float64) - offset
     np.testing.assert_allclose(found[:, 4:], expected[:, 4:], atol=1e-4)
     np.testing.assert_allclose(found[:, :4], expected[:, :4], atol=1e-3)
 

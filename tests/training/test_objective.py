@@ -30,9 +30,9 @@ def samples():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("offset", [0.0, 0.1])
-def test_a_batch_taken_together_has_the_gradients_of_its_pairs_one_by_one(small_model, samples, monkeypatch, offset):
-    config = dataclasses.replace(SMALL, symmetry_breaking_offset=offset)
+def test_a_batch_taken_together_has_the_gradients_of_its_pairs_one_by_one(small_model, samples, monkeypatch):
+    """With clouds displaced from their farthest points, which the encoder then does as well for all at once."""
+    config = dataclasses.replace(SMALL, symmetry_breaking_offset=0.1)
     frame = 0.1 * np.random.default_rng(1).normal(size=(config.latent, 3)).astype(np.float32)
     params = {"network": small_model.params, "frame": jnp.asarray(frame)}
     found = {}
