@@ -230,7 +230,7 @@ def test_an_unknown_baseline_raises_before_anything_runs():
 def test_the_shipped_weights_transfer_a_pose_and_random_ones_do_not():
     model = tdf.load_model("mug")
     cases = [mug_case(0, index) for index in range(3)]
-    config = tdf.OptimizeConfig(num_starts=5, iterations=60)
+    config = tdf.OptimizeConfig(num_starts=5, iterations=40)
     distance, angle = place_errors(transferred(model, cases, config=config, progress=False), cases)
     assert (distance < 0.02).all() and (angle < 20).all(), (distance, angle)
     encoded, refined = overlaps(model, cases[:1], samples=4000).values()
