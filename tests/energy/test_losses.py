@@ -241,7 +241,9 @@ def test_an_unknown_norm_is_refused():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_descriptor_loss_is_unchanged_when_all_moves_together(golden, golden_reference, precision, seed):
+def test_the_descriptor_loss_is_unchanged_when_all_moves_together(
+    golden, golden_reference, precision, seed, quick_compilation
+):
     motion, aside = random_poses(seed, 1)[0], np.array([1, 0, 0, 0, 0.3, -0.2, 0.1])
     with enabled(precision):
 
