@@ -13,7 +13,8 @@ OCCUPIED = 0.5  # occupancy that counts as touching
 RANK = 2  # the touch is that of the second point, so that one wrong value does not decide
 NEIGHBOURS = 4  # points half way to the nearest neighbours are tested too: few points of a cloud are on a thin peg
 BESIDE = 0.01  # metres across the direction within which a point may meet the other object
-POINTS = 256  # points of each object that are tested
+SIDEWAYS = 2.0  # weight of the distance across the direction when those points are chosen
+POINTS = 512  # points of each object that are tested
 CLOUD = 2000  # points of each cloud that are looked at; more cost time and memory, and say no more
 PADDING = 128  # the points are filled up to a multiple of it, so that few programs are compiled
 
@@ -76,7 +77,7 @@ def _denser(points: np.ndarray) -> np.ndarray:
 
 
 def _meeting(points, target_points, direction) -> tuple[np.ndarray, np.ndarray]:
-    """Points of either cloud that may meet the other along a direction, at most `POINTS` of each."""
+    """Points of either cloud that may meet the other along a direction: at most `POINTS` of each."""
     from scipy.spatial import KDTree
 
     across = np.linalg.svd(direction[None])[2][1:].T
@@ -85,9 +86,20 @@ def _meeting(points, target_points, direction) -> tuple[np.ndarray, np.ndarray]:
     )
     gaps = target_points[pairs.col] @ direction - points[pairs.row] @ direction
     meets = np.abs(gaps) < 2 * REACH
-    chosen = (np.unique(index[meets]) for index in (pairs.row, pairs.col))
-    mine, other = (index[np.linspace(0, len(index) - 1, min(POINTS, len(index))).astype(int)] for index in chosen)
-    return points[mine], target_points[other]
+    gaps, beside = gaps[meets], SIDEWAYS * pairs.data[meets]
+    chosen = []
+    for cloud, index in ((points, pairs.row[meets]), (target_points, pairs.col[meets])):
+        # The nearest points touch first. If the two overlap deeply, the deepest ones come free last.
+        picked = [_first(len(cloud), index, measure) for measure in (np.hypot(gaps, beside), gaps + beside)]
+        chosen.append(cloud[np.union1d(*picked)])
+    return chosen[0], chosen[1]
+
+
+def _first(count: int, index: np.ndarray, measures: np.ndarray) -> np.ndarray:
+    """Numbers of the points, at most half of `POINTS`, that have the smallest measures in any of their pairs."""
+    least = np.full(count, np.inf)
+    np.minimum.at(least, index, measures)
+    return np.argsort(least, kind="stable")[: min(POINTS // 2, int(np.isfinite(least).sum()))]
 
 
 def _highest(field: DescriptorField, x: Float[np.ndarray, "steps count 3"]) -> Float[np.ndarray, " steps"]:
