@@ -86,14 +86,14 @@ def size_of(one: Shape | AnnotatedMesh) -> float:
     return one.height if one.category == "mug" else float(np.linalg.norm(one.mesh.extents))
 
 
-def object_of(category: str, seed: int, index: int, size: float, fold: int | None = None) -> Shape:
+def object_of(category: str, seed: int, index: int, size: float | None, fold: int | None = None) -> Shape:
     """A generated object that no training run has.
 
     Args:
         category: family of the object.
         seed: seed of the objects.
         index: number of the object.
-        size: size, see `size_of`, metres.
+        size: size, see `size_of`, metres; None for the object's own, as it was drawn.
         fold: symmetry of the object; any by default.
     """
     family, rng = FAMILIES[category], np.random.default_rng([SEED_SPACE, seed, index])
@@ -101,7 +101,7 @@ def object_of(category: str, seed: int, index: int, size: float, fold: int | Non
     while fold not in (None, parameters.fold):
         parameters = family.sample(rng)
     one = family.build(parameters)
-    return scaled(one, size / size_of(one))
+    return one if size is None else scaled(one, size / size_of(one))
 
 
 def mug_of(seed: int, index: int, height: float) -> Mug:
@@ -129,6 +129,7 @@ def generated_case(
     points: int = 1500,
     place: str | None = None,
     clouds: str = "full",
+    natural: bool = False,
 ) -> Case:
     """Pair `index` of a seed: two unseen generated objects of one size and symmetry, the second in a random pose.
 
@@ -141,12 +142,13 @@ def generated_case(
         points: number of points of each complete cloud, uniform by area.
         place: name of a frame of the category; by default the frame at which demonstrations pick.
         clouds: condition of the second object's cloud; objects and poses do not depend on it.
+        natural: each object keeps its own size, as it was drawn, instead of `size` and conditions of size.
 
     Raises:
         InputError: there is no such condition or place.
     """
     scale = _scale("generated_case", clouds)
-    size = (FAMILIES[category].size if size is None else size) * scale
+    size = None if natural else (FAMILIES[category].size if size is None else size) * scale
     a = object_of(category, seed, 2 * index, size)
     b = object_of(category, seed, 2 * index + 1, size, fold=a.fold)
     return _case(a, b, seed, index, points, place, clouds, f"{category} {index}")

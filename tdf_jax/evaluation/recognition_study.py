@@ -2,7 +2,8 @@
 
 Every case has a demonstration at the usual place of an unseen generated object. The target of a right case is another
 object of that category; the target of a wrong case is of another category. The clouds of the targets are in turn
-complete, seen by one camera, seen by two, and 300 noisy points.
+complete, seen by one camera, seen by two, and 300 noisy points. In half of the cases, four by four, both objects have
+the common size of their category; in the others each has its own, as it was drawn.
 
     python -m tdf_jax.evaluation.recognition_study --weights mug --seed 15
 """
@@ -34,6 +35,15 @@ CLOUDS = ("full", "views1", "views2", "noise")
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)  # probabilities below which an object counts as of another category
 
 
+def has_natural_size(index: int) -> bool:
+    """Whether the objects of a case have their own sizes.
+
+    Args:
+        index: number of the case.
+    """
+    return index // len(CLOUDS) % 2 == 1
+
+
 def evidence(model: Model, category: str, seed: int, index: int, right: bool) -> tuple[float, float]:
     """Residual and surface logit of one case.
 
@@ -44,9 +54,10 @@ def evidence(model: Model, category: str, seed: int, index: int, right: bool) ->
         index: number of the case.
         right: whether the target is of that category.
     """
-    clouds, others = CLOUDS[index % len(CLOUDS)], [name for name in CATEGORIES if name != category]
-    case = generated_case(category, seed, index, clouds=clouds)
-    target = case if right else generated_case(others[index // len(CLOUDS) % len(others)], seed, index, clouds=clouds)
+    clouds, natural = CLOUDS[index % len(CLOUDS)], has_natural_size(index)
+    others = [name for name in CATEGORIES if name != category]
+    other = category if right else others[index // (2 * len(CLOUDS)) % len(others)]
+    case, target = (generated_case(name, seed, index, clouds=clouds, natural=natural) for name in (category, other))
     demonstration = place_demonstration(case, "line", 2, box_query(jax.random.key(seed), QUERIES, QUERY_SIZE))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TdfWarning)
@@ -67,7 +78,7 @@ def collected(
         count: number of right cases, and of wrong ones.
 
     Returns:
-        Residuals and surface logits, (cases, 2); 1 for right cases, (cases,); numbers of their clouds in `CLOUDS`.
+        Residuals and surface logits, (cases, 2); 1 for right cases, (cases,); numbers of the cases, (cases,).
     """
     rows, right = [], []
     for index in range(count):
@@ -76,7 +87,7 @@ def collected(
             right.append(float(is_right))
         print(f"{category}, seed {seed}: {index + 1} of {count}", end="\r", flush=True)
     print()
-    return np.array(rows), np.array(right), np.arange(len(right)) // 2 % len(CLOUDS)
+    return np.array(rows), np.array(right), np.arange(len(right)) // 2
 
 
 def features(rows: Float[np.ndarray, "cases 2"]) -> Float[np.ndarray, "cases 2"]:
@@ -87,31 +98,39 @@ def features(rows: Float[np.ndarray, "cases 2"]) -> Float[np.ndarray, "cases 2"]
 def summary(
     rows: Float[np.ndarray, "cases 2"],
     right: Float[np.ndarray, " cases"],
-    clouds: Int[np.ndarray, " cases"],
+    numbers: Int[np.ndarray, " cases"],
     curve: Float[np.ndarray, "3"],
 ) -> dict:
-    """The area under the ROC of a curve and of the residual alone, and rates at all `LEVELS`.
+    """The area under the ROC of a curve and of the residual alone, and rates at all `LEVELS`, by size too.
 
     Args:
         rows: residuals and surface logits, (cases, 2).
         right: 1 for right cases, (cases,).
-        clouds: numbers of their clouds in `CLOUDS`, (cases,).
+        numbers: numbers of the cases, (cases,).
         curve: intercept and both slopes, (3,).
     """
     intercept, slope, logit_slope = map(float, curve)
     predicted = np.array(
         [recognition(float(residual), float(logit), (intercept, slope, logit_slope)) for residual, logit in rows]
     )
-    rates = {
+    natural = np.array([has_natural_size(int(number)) for number in numbers])
+    areas = {"area": ranking(predicted, right), "area_of_the_residual_alone": ranking(-rows[:, 0], right)}
+    kinds = numbers % len(CLOUDS)
+    by_cloud = {name: ranking(predicted[kinds == kind], right[kinds == kind]) for kind, name in enumerate(CLOUDS)}
+    sizes = {"common": ~natural, "natural": natural}
+    by_size = {name: _rates(predicted[these], right[these]) for name, these in sizes.items() if these.any()}
+    thresholds = {"thresholds": _rates(predicted, right), "thresholds_by_size": by_size}
+    return {"cases": len(right), **areas, "area_by_cloud": by_cloud, **thresholds}
+
+
+def _rates(predicted: np.ndarray, right: np.ndarray) -> dict:
+    return {
         str(level): {
             "wrong_noticed": float(np.mean(predicted[right == 0] < level)),
             "right_doubted": float(np.mean(predicted[right == 1] < level)),
         }
         for level in LEVELS
     }
-    areas = {"area": ranking(predicted, right), "area_of_the_residual_alone": ranking(-rows[:, 0], right)}
-    by_cloud = {name: ranking(predicted[clouds == kind], right[clouds == kind]) for kind, name in enumerate(CLOUDS)}
-    return {"cases": len(right), **areas, "area_by_cloud": by_cloud, "thresholds": rates}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -144,10 +163,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             f"--weights is {options.weights}, which has no curve; expected one of {', '.join(CURVES)}, or --fit"
         )
     parts = [collected(model, category, options.seed, options.count) for category in options.category]
-    rows, right, clouds = (np.concatenate(column) for column in zip(*parts))
+    rows, right, numbers = (np.concatenate(column) for column in zip(*parts))
     curve = logistic(features(rows), right) if options.fit else np.array(CURVES[model.info.name])
     settings = {name: value for name, value in vars(options).items() if name != "out"}
-    record = header(settings, model) | {"curve": [float(x) for x in curve]} | summary(rows, right, clouds, curve)
+    record = header(settings, model) | {"curve": [float(x) for x in curve]} | summary(rows, right, numbers, curve)
     record["categories"] = {category: summary(*part, curve) for category, part in zip(options.category, parts)}
     print(json.dumps(record, indent=1))
     if options.out is not None:

@@ -17,6 +17,7 @@ from tdf_jax.energy.seating import touch_distance
 from tdf_jax.evaluation.relation_success import signed_distances
 from tdf_jax.evaluation.relation_tasks import POSES, RELATIONS, Placement, demonstrate, draw_pair, moved, place_pair
 from tdf_jax.geometry import se3
+from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory, resample
 from tdf_jax.geometry.transport import ARRIVAL, arrival_depth, arrival_of, carry_to_target, carry_trajectory
 from tdf_jax.networks.checkpoint import load_model
@@ -113,12 +114,32 @@ def paths(task: str, poses: str, number: int, seed: int = SEED) -> dict[str, Mea
         "even": carry_trajectory(*ends),
         f"arrival of {100 * ARRIVAL:.0f} cm": carry_to_target(*ends, _pose(moves)),
         "arrival as demonstrated": carry_to_target(*ends, _pose(moves), arrival=arrival.length),
+        "weights by nearness": stretched(shares=_nearness(demonstration, path)),
         "departure relative to the object": stretched(upright=False),
         "departure upwards": stretched(),
     }
     approach = -pair.T_target_contact[:3, 0] if task == "mug_on_rack" else np.array([0.0, 0.0, -1.0])
     corners = pair.object.mesh.vertices[:: max(1, len(pair.object.mesh.vertices) // POINTS)]
     return {name: _measured(placement, grasp, one, corners, approach) for name, one in warped.items()}
+
+
+def _nearness(demonstration: Demonstration, path: Trajectory) -> Array:
+    """Weight of the goal's side at every pose: the nearer the demonstrated object is to its target, the more.
+
+    A field knows a place the better, the nearer it is: the distances are those of the carried object to where it stood
+    and to its target.
+    """
+    from scipy.spatial import KDTree
+
+    assert demonstration.target is not None
+    T = np.asarray(path.matrices, float)
+    motions = T @ np.linalg.inv(T[0])
+    cloud = np.asarray(demonstration.points, float)[::5]
+    left = np.array([np.linalg.norm(moved(cloud, M) - cloud, axis=1).mean() for M in motions])
+    tree = KDTree(np.asarray(demonstration.target.points, float))
+    gaps = np.array([tree.query(moved(cloud, M))[0].min() for M in motions])
+    gaps = np.maximum(gaps - gaps[-1], 0)
+    return jnp.asarray(left / np.maximum(left + gaps, 1e-9), jnp.float32)
 
 
 def _measured(placement: Placement, grasp, path: Trajectory, corners, approach) -> Measured:

@@ -68,6 +68,7 @@ def carry_to_target(
     arrival: float | Float[Array, ""] = ARRIVAL,
     deeper: float | Float[Array, ""] = 0.0,
     upright: bool = True,
+    shares: Float[Array, " poses"] | None = None,
 ) -> Trajectory:
     """Warp a demonstrated path between a pick and a goal at a target, repeating the demonstrated motion at both ends.
 
@@ -91,6 +92,8 @@ def carry_to_target(
         upright: turn the demonstrated displacement after the pick by A's rotation about the world's z axis only, so
             that an object that was lifted from its support is lifted from it; False to turn it by all of A's rotation,
             so that the object moves in the same direction of its own.
+        shares: weight of the goal's side at every pose, from 0 at the pick to 1 at the goal, (poses,); by default by
+            the length of the path, see above.
 
     Returns:
         The warped path, T_world_query, with as many poses.
@@ -115,7 +118,7 @@ def carry_to_target(
     outward = outward / jnp.maximum(jnp.linalg.norm(outward), 1e-9)
     arriving = arriving.at[:, 4:].add(deeper * left[:, None] * outward)
     s = jnp.clip((length - begin) / (end - begin), 0.0, 1.0)
-    s = s * s * (3 - 2 * s)
+    s = s * s * (3 - 2 * s) if shares is None else jnp.asarray(shares)
     R = se3.geodesic(se3.rotation(leaving), se3.rotation(arriving), s)
     t = (1 - s)[:, None] * leaving[:, 4:] + s[:, None] * arriving[:, 4:]
     return Trajectory(se3.pose(R, t))

@@ -63,6 +63,16 @@ def test_pairs_are_of_one_category_size_and_symmetry(category):
         assert case.instance == f"{category} {index}"
 
 
+def test_objects_keep_their_own_sizes_where_it_is_asked():
+    own, same = (generated_case("bowl", 2, 1, points=60, natural=natural) for natural in (True, False))
+    sizes = [size_of(one) for one in (own.object_a, own.object_b)]
+    assert abs(sizes[0] - sizes[1]) > 0.005
+    for one, other in ((own.object_a, same.object_a), (own.object_b, same.object_b)):
+        assert one.fold == other.fold
+        vertices = one.mesh.vertices * (FAMILIES["bowl"].size / size_of(one))
+        np.testing.assert_allclose(vertices, other.mesh.vertices, atol=1e-9)  # only the sizes differ
+
+
 def test_mugs_are_compared_by_height_and_others_by_diagonal():
     assert size_of(object_of("mug", 0, 0, 0.1)) == object_of("mug", 0, 0, 0.1).parameters.height == pytest.approx(0.1)
     assert np.linalg.norm(object_of("bowl", 0, 0, 0.25).mesh.extents) == pytest.approx(0.25)
