@@ -63,8 +63,8 @@ def quick_environment() -> dict[str, str]:
 
 
 def pytest_runtest_setup(item):
-    """Programs are compiled with few optimisations, but for the fast tests of parity, which are of what users run."""
-    parity = "golden" in item.fixturenames and not item.get_closest_marker("slow")
+    """Programs are compiled with few optimisations, but for parity in float32, which is of what users run."""
+    parity = "golden" in item.fixturenames and "float64" not in item.callspec.params.values()
     jax.config.update("jax_disable_most_optimizations", "quick_compilation" in item.fixturenames or not parity)
 
 
