@@ -24,7 +24,7 @@ from tdf_jax.solvers.initial import default_goal
 from tdf_jax.solvers.multistart import SolveConfig, solve
 from tdf_jax.solvers.pick import CarryConfig, carry
 from tdf_jax.solvers.result import Result
-from tdf_jax.uncertainty.calibration import CALIBRATED, CURVES, confidence, recognition, surface_logit
+from tdf_jax.uncertainty.calibration import CALIBRATED, CURVES, TARGET_CURVES, confidence, recognition, surface_logit
 
 # Probability of the demonstration's category, or of a right pick, below which a warning is issued.
 DOUBT = 0.5
@@ -86,7 +86,7 @@ def imitate(
         InputError: bad points, goal, offset or settings, or an energy that `carry` would not use.
 
     Warns:
-        CategoryWarning: the object is probably of another category than the demonstration's.
+        CategoryWarning: the object, or the target, is probably of another category than the demonstration's.
         ConfidenceWarning: the pick is probably wrong. Both are known for shipped weights and the default config.
         SizeWarning: see `encode`.
     """
@@ -115,7 +115,10 @@ def imitate(
         if target_points is not None:
             check_apart("imitate()", points, target_points)
         search = {"config": config, "seat": seat, "progress": progress, "device_mesh": device_mesh}
-        return _judged(carry_object(objects, reference, key, **search), model.info.name, field, points)
+        result = carry_object(objects, reference, key, **search)
+        if target_points is not None:
+            _check_target(result, model if target_model is None else target_model, objects)
+        return _judged(result, model.info.name, field, points)
     goal = None if goal is None else jnp.asarray(checks.pose("imitate()", "goal", goal), float)
     if goal_offset is not None:
         goal = default_goal(field, reference) if goal is None else goal
@@ -128,6 +131,21 @@ def imitate(
     if isinstance(config, OptimizeConfig):
         return optimize(field, reference, key, energy=weights, config=config, **settings)
     return solve(field, reference, key, energy=weights, config=config, **settings)
+
+
+def _check_target(result: Result, model: Model, objects: Objects) -> None:
+    """Warn of a target of another category than the demonstration's, where that is known for the weights."""
+    if model.info.name not in TARGET_CURVES or objects.target is None or objects.target_points is None:
+        return
+    curve, logit = TARGET_CURVES[model.info.name], surface_logit(objects.target, jnp.asarray(objects.target_points))
+    recognised = recognition(float(result.target_residual), logit, curve)
+    if recognised is not None and recognised < DOUBT:
+        warnings.warn(
+            "imitate(): the target does not look like one of the demonstration's category to the weights "
+            f"{model.info.name!r} (probability {recognised:.2g}); check target_points, their unit and target_model",
+            CategoryWarning,
+            stacklevel=caller_level(),
+        )
 
 
 def _judged(result: Result, weights: str, field, points) -> Result:

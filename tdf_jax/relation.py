@@ -218,7 +218,7 @@ def find_relations(
             f"{function}: the demonstration has no target; expected Demonstration(target=tdf.Target(...)), or a goal"
         )
     object_key, target_key = (jax.random.fold_in(key, stream) for stream in (OBJECT_STREAM, TARGET_STREAM))
-    on_object, object_energies = _distinct(
+    on_object, object_energies = distinct_contacts(
         function,
         "object",
         objects.field,
@@ -234,7 +234,7 @@ def find_relations(
     else:
         if objects.target is None or contact.target_descriptors is None or contact.T_target_contact is None:
             raise InputError(f"{function}: the reference does not have the target's descriptors; see `describe`")
-        on_target, target_energies = _distinct(
+        on_target, target_energies = distinct_contacts(
             function,
             "target",
             objects.target,
@@ -268,8 +268,34 @@ def _seatings(objects: Objects, found: Relations, contact: Contact) -> Float[np.
     return (np.nan_to_num(distances)[:, None] * directions).astype(np.float32)
 
 
-def _distinct(function, what, field, descriptors, T_origin_contact, contact: Contact, key, config: CarryConfig):
-    """Distinct poses of the contact frame in a field, and their energies, the best first."""
+def distinct_contacts(
+    function: str,
+    what: str,
+    field: DescriptorField,
+    descriptors: Float[Array, "queries channels"],
+    T_origin_contact: Float[Array, "7"],
+    contact: Contact,
+    key: PRNGKeyArray,
+    config: CarryConfig,
+) -> tuple[Float[np.ndarray, "contacts 7"], Float[np.ndarray, " contacts"]]:
+    """Distinct poses of the contact frame in a field, and their energies, the best first.
+
+    Args:
+        function: name that the messages begin with.
+        what: "object" or "target", for them.
+        field: field of the object or of the target.
+        descriptors: descriptors of the demonstrated region in the demonstrated object's or target's field.
+        T_origin_contact: its pose there, relative to the centroid of the cloud, `wxyz_xyz`, (7,).
+        contact: the demonstrated region.
+        key: random key.
+        config: settings of the search.
+
+    Returns:
+        The poses, world frame, `wxyz_xyz`, (contacts, 7), and their energies, (contacts,).
+
+    Raises:
+        InputError: nothing finite was found.
+    """
     alone = Reference(descriptors[None], Trajectory(T_origin_contact[None]), contact.query)
     found = solve(field, alone, key, fix_last=False, energy=EnergyWeights(0.0), config=config.solver)
     modes = cluster_poses(jnp.asarray(found.picks), jnp.asarray(found.energies))

@@ -13,6 +13,7 @@ import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.transport import BEYOND, NEAR, arrival_depth, arrival_of, carry_to_target
+from tdf_jax.uncertainty.calibration import TARGET_CURVES
 
 KEY = jax.random.key(3)
 carried_path = jax.jit(carry_to_target)
@@ -120,6 +121,16 @@ def test_a_network_of_a_target_that_stands_where_it_stood_seats_the_object(small
     assert seen[0] is None
     there = tdf.encode(small_model, related.target.points)
     np.testing.assert_allclose(seen[-1].latent, there.latent, atol=1e-6)
+
+
+def test_a_target_of_another_category_is_warned_of(small_model, related, moved, monkeypatch):
+    reference = tdf.describe(small_model, related, target_model=small_model)
+    options = {"points": moved[0], "target_points": moved[1], "key": KEY, "config": SEARCH}
+    monkeypatch.setitem(TARGET_CURVES, "small", (-50.0, 0.0, 0.0))
+    with pytest.warns(tdf.CategoryWarning, match="the target does not look like one .* check target_points"):
+        tdf.imitate(small_model, reference, **options)
+    monkeypatch.setitem(TARGET_CURVES, "small", (50.0, 0.0, 0.0))
+    tdf.imitate(small_model, reference, **options)  # without a warning, which would be an error
 
 
 def test_a_shared_reference_gives_the_same(small_model, related, moved, result):

@@ -6,12 +6,18 @@ complete, seen by one camera, seen by two, and 300 noisy points. In half of the 
 the common size of their category; in the others each has its own, as it was drawn.
 
     python -m tdf_jax.evaluation.recognition_study --weights mug --seed 15
+
+With `--task` the targets of a relation are recognised instead: the evidence is the residual of the contact region and
+the surface logit of the target.
+
+    python -m tdf_jax.evaluation.recognition_study --task bowl_on_mug --seed 15
 """
 
 import argparse
+import functools
 import json
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
@@ -19,15 +25,21 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tdf_jax._internal.errors import TdfWarning
+from tdf_jax.energy.reference import Reference, describe
+from tdf_jax.energy.residual import pick_residual
 from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, generated_case, place_demonstration
 from tdf_jax.evaluation.records import header, write_record
+from tdf_jax.evaluation.relation_scores import DEMONSTRATIONS, FIRST_DEMONSTRATION
+from tdf_jax.evaluation.relation_tasks import RELATIONS, demonstrate, draw_pair
 from tdf_jax.geometry.query import box_query
 from tdf_jax.imitation import imitate
 from tdf_jax.networks.checkpoint import load_model
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.model import Model
+from tdf_jax.relation import distinct_contacts
 from tdf_jax.shapes import FAMILIES
-from tdf_jax.uncertainty.calibration import CURVES, logistic, ranking, recognition, surface_logit
+from tdf_jax.solvers.pick import CarryConfig
+from tdf_jax.uncertainty.calibration import CURVES, TARGET_CURVES, logistic, ranking, recognition, surface_logit
 
 # Categories of the weights whose curves are fitted; the objects of another category are drawn from them.
 CATEGORIES = ("mug", "bowl", "bottle")
@@ -66,15 +78,45 @@ def evidence(model: Model, category: str, seed: int, index: int, right: bool) ->
     return float(result.residual), surface_logit(encode(model, points), points)
 
 
-def collected(
-    model: Model, category: str, seed: int, count: int
-) -> tuple[Float[np.ndarray, "cases 2"], Float[np.ndarray, " cases"], Int[np.ndarray, " cases"]]:
-    """Evidence of right and wrong cases of a category.
+@functools.cache
+def _described(task: str, number: int, seed: int, object_model: Model, target_model: Model) -> Reference:
+    pair = draw_pair(task, seed, FIRST_DEMONSTRATION + number)
+    return describe(object_model, demonstrate(pair, seed), target_model=target_model)
+
+
+def target_evidence(models: tuple[Model, Model], task: str, seed: int, index: int, right: bool) -> tuple[float, float]:
+    """Residual of the contact region and surface logit of one target.
 
     Args:
-        model: the network.
-        category: category of the demonstrations.
+        models: networks of the object and of the target.
+        task: name in `RELATIONS`.
         seed: seed of the cases.
+        index: number of the case.
+        right: whether the target is of the category of the task's targets.
+    """
+    category, clouds = RELATIONS[task].target, CLOUDS[index % len(CLOUDS)]
+    others = [name for name in FAMILIES if name != category]
+    name = category if right else others[index // len(CLOUDS) % len(others)]
+    points = jax.device_put(generated_case(name, seed, index, clouds=clouds, natural=True).points_b)
+    contact = _described(task, index % DEMONSTRATIONS, seed, *models).contact
+    assert contact is not None and contact.target_descriptors is not None and contact.T_target_contact is not None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TdfWarning)
+        field = encode(models[1], points)
+    key = jax.random.key(index)
+    region = contact.target_descriptors, contact.T_target_contact, contact
+    _, energies = distinct_contacts("recognition_study", "target", field, *region, key, CarryConfig())
+    return pick_residual(float(energies[0]), contact.target_descriptors), surface_logit(field, points)
+
+
+def collected(
+    case: Callable[[int, bool], tuple[float, float]], name: str, count: int
+) -> tuple[Float[np.ndarray, "cases 2"], Float[np.ndarray, " cases"], Int[np.ndarray, " cases"]]:
+    """Evidence of right and wrong cases.
+
+    Args:
+        case: the evidence of a case, from its number and whether it is a right one.
+        name: name of the cases, which is printed.
         count: number of right cases, and of wrong ones.
 
     Returns:
@@ -83,9 +125,9 @@ def collected(
     rows, right = [], []
     for index in range(count):
         for is_right in (True, False):
-            rows.append(evidence(model, category, seed, index, is_right))
+            rows.append(case(index, is_right))
             right.append(float(is_right))
-        print(f"{category}, seed {seed}: {index + 1} of {count}", end="\r", flush=True)
+        print(f"{name}: {index + 1} of {count}", end="\r", flush=True)
     print()
     return np.array(rows), np.array(right), np.arange(len(right)) // 2
 
@@ -148,6 +190,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--category", choices=list(FAMILIES), nargs="+", default=["mug"], help="categories of the demonstrations"
     )
+    parser.add_argument(
+        "--task", choices=list(RELATIONS), help="recognise the targets of a relation; the weights are those of the task"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of the cases")
     parser.add_argument("--count", type=int, default=100, help="right cases, and as many wrong ones, of each category")
     parser.add_argument(
@@ -157,17 +202,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     if options.count < 1:
         parser.error(f"--count is {options.count}; expected at least 1")
-    model = load_model(options.weights)
-    if not options.fit and model.info.name not in CURVES:
-        parser.error(
-            f"--weights is {options.weights}, which has no curve; expected one of {', '.join(CURVES)}, or --fit"
-        )
-    parts = [collected(model, category, options.seed, options.count) for category in options.category]
+    if options.task is None:
+        model, curves, names = load_model(options.weights), CURVES, options.category
+        cases = [functools.partial(evidence, model, name, options.seed) for name in names]
+    else:
+        relation, curves, names = RELATIONS[options.task], TARGET_CURVES, [options.task]
+        models = load_model(relation.object), load_model(relation.target)
+        model, cases = models[1], [functools.partial(target_evidence, models, options.task, options.seed)]
+    if not options.fit and model.info.name not in curves:
+        parser.error(f"the weights {model.info.name} have no curve; expected one of {', '.join(curves)}, or --fit")
+    parts = [collected(case, name, options.count) for case, name in zip(cases, names, strict=True)]
     rows, right, numbers = (np.concatenate(column) for column in zip(*parts))
-    curve = logistic(features(rows), right) if options.fit else np.array(CURVES[model.info.name])
+    curve = logistic(features(rows), right) if options.fit else np.array(curves[model.info.name])
     settings = {name: value for name, value in vars(options).items() if name != "out"}
     record = header(settings, model) | {"curve": [float(x) for x in curve]} | summary(rows, right, numbers, curve)
-    record["categories"] = {category: summary(*part, curve) for category, part in zip(options.category, parts)}
+    record["categories"] = {name: summary(*part, curve) for name, part in zip(names, parts)}
     print(json.dumps(record, indent=1))
     if options.out is not None:
         write_record("recognition_study", options.out, record)

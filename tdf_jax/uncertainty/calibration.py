@@ -33,6 +33,9 @@ CURVES = {
     "bottle": (-20.1, 16.7, 1.18),
     "multi": (-5.40, 5.28, -0.01),
 }
+# The same for the contact region on a target, see `tdf_jax.relation`: by the name of the target's weights, fitted by
+# `python -m tdf_jax.evaluation.recognition_study --task TASK --fit`, seed 61.
+TARGET_CURVES: dict[str, tuple[float, float, float]] = {}
 
 
 @public
