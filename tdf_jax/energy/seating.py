@@ -15,7 +15,7 @@ NEIGHBOURS = 4  # points half way to the nearest neighbours are tested too: few 
 BESIDE = 0.01  # metres across the direction within which a point may meet the other object
 SIDEWAYS = 2.0  # weight of the distance across the direction when those points are chosen
 POINTS = 512  # points of each object that are tested
-CLOUD = 2000  # points of each cloud that are looked at; more cost time and memory, and say no more
+CLOUD = 2000  # points of each cloud that are looked at; more cost time and memory, and change nothing
 PADDING = 128  # the points are filled up to a multiple of it, so that few programs are compiled
 
 
@@ -53,9 +53,9 @@ def touch_distance(
         return np.nan
     steps = np.linspace(-REACH, REACH, 2 * STEPS + 1)
     shifts = steps[:, None, None] * direction
-    occupied = [_highest(field, (target_near - shifts - t) @ R)]
+    occupied = [_ranked_occupancy(field, (target_near - shifts - t) @ R)]
     if target is not None:
-        occupied.append(_highest(target, near + shifts))
+        occupied.append(_ranked_occupancy(target, near + shifts))
     return _first_touch(steps, np.max(occupied, axis=0))
 
 
@@ -71,9 +71,10 @@ def _denser(points: np.ndarray) -> np.ndarray:
     from scipy.spatial import KDTree
 
     nearest = np.asarray(KDTree(points).query(points, min(NEIGHBOURS + 1, len(points)))[1]).reshape(len(points), -1)
-    one, other = np.repeat(nearest[:, 0], nearest.shape[1] - 1), nearest[:, 1:].ravel()  # the first is the point itself
-    once = one < other
-    return np.concatenate([points, (points[one[once]] + points[other[once]]) / 2])
+    # The first is the point itself. Neighbourhoods are not mutual, and a pair that is counts once.
+    pairs = np.stack([np.repeat(nearest[:, 0], nearest.shape[1] - 1), nearest[:, 1:].ravel()], axis=1)
+    one, other = np.unique(np.sort(pairs, axis=1), axis=0).T
+    return np.concatenate([points, (points[one] + points[other]) / 2])
 
 
 def _meeting(points, target_points, direction) -> tuple[np.ndarray, np.ndarray]:
@@ -90,19 +91,19 @@ def _meeting(points, target_points, direction) -> tuple[np.ndarray, np.ndarray]:
     chosen = []
     for cloud, index in ((points, pairs.row[meets]), (target_points, pairs.col[meets])):
         # The nearest points touch first. If the two overlap deeply, the deepest ones come free last.
-        picked = [_first(len(cloud), index, measure) for measure in (np.hypot(gaps, beside), gaps + beside)]
+        picked = [_closest(len(cloud), index, measure) for measure in (np.hypot(gaps, beside), gaps + beside)]
         chosen.append(cloud[np.union1d(*picked)])
     return chosen[0], chosen[1]
 
 
-def _first(count: int, index: np.ndarray, measures: np.ndarray) -> np.ndarray:
+def _closest(count: int, index: np.ndarray, measures: np.ndarray) -> np.ndarray:
     """Numbers of the points, at most half of `POINTS`, that have the smallest measures in any of their pairs."""
     least = np.full(count, np.inf)
     np.minimum.at(least, index, measures)
     return np.argsort(least, kind="stable")[: min(POINTS // 2, int(np.isfinite(least).sum()))]
 
 
-def _highest(field: DescriptorField, x: Float[np.ndarray, "steps count 3"]) -> Float[np.ndarray, " steps"]:
+def _ranked_occupancy(field: DescriptorField, x: Float[np.ndarray, "steps count 3"]) -> Float[np.ndarray, " steps"]:
     """The occupancy of the `RANK`-th point at every displacement."""
     steps, count, _ = x.shape
     padded = np.zeros((steps, -(-count // PADDING) * PADDING, 3), np.float32)
