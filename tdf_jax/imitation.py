@@ -14,11 +14,11 @@ from tdf_jax._internal.boundary import host
 from tdf_jax._internal.deprecation import caller_level, renamed_keywords
 from tdf_jax._internal.errors import CategoryWarning, ConfidenceWarning, InputError
 from tdf_jax.energy.losses import EnergyWeights
-from tdf_jax.energy.reference import Reference, describe
-from tdf_jax.geometry.demonstration import Demonstration, check_apart
+from tdf_jax.energy.reference import Reference
+from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.model import Model
-from tdf_jax.relation import Objects, carry_object, reference_of, target_field
+from tdf_jax.relation import Objects, carry_object, check_scene, reference_of, target_field
 from tdf_jax.solvers.adam import OptimizeConfig, optimize
 from tdf_jax.solvers.initial import default_goal
 from tdf_jax.solvers.multistart import SolveConfig, solve
@@ -112,8 +112,7 @@ def imitate(
     field = encode(model, points)
     if reference.contact is not None:
         objects = Objects(points, target_points, field, target_field(model, reference, target_points, target_model))
-        if target_points is not None:
-            check_apart("imitate()", points, target_points)
+        check_scene("imitate()", points, target_points, reference)
         search = {"config": config, "seat": seat, "progress": progress, "device_mesh": device_mesh}
         result = carry_object(objects, reference, key, **search)
         if target_points is not None:
@@ -158,7 +157,7 @@ def _judged(result: Result, weights: str, field, points) -> Result:
     if recognised is not None and recognised < DOUBT:
         warnings.warn(
             "imitate(): the object does not look like one of the demonstration's category to the weights "
-            f"{weights!r} (probability {recognised:.2g}); check the target, its unit and the weights",
+            f"{weights!r} (probability {recognised:.2g}); check points, their unit and the weights",
             CategoryWarning,
             stacklevel=caller_level(),
         )
@@ -188,18 +187,18 @@ def imitate_batch(
 ) -> list[Result]:
     """Imitate on many new objects with one compiled program.
 
-    The demonstration is encoded once. Targets run one after the other: one target's starts already fill the machine,
-    and memory does not grow with the number of targets.
+    The demonstration is encoded once. Objects run one after the other: one object's starts already fill the machine,
+    and memory does not grow with their number.
 
     Args:
         model: as for `imitate`.
         demonstration: as for `imitate`.
-        clouds: one point cloud for each target, (points, 3), metres, world frame; sizes may differ.
-        key: random key; target i uses `jax.random.fold_in(key, i)`.
-        **settings: as for `imitate`, shared by all targets.
+        clouds: one point cloud for each object, (points, 3), metres, world frame; sizes may differ.
+        key: random key; object i uses `jax.random.fold_in(key, i)`.
+        **settings: as for `imitate`, shared by all objects; so is a new target.
 
     Returns:
-        One result for each target, in order.
+        One result for each object, in order.
 
     Raises:
         InputError: no clouds, or as for `imitate`.
@@ -208,7 +207,8 @@ def imitate_batch(
     clouds = list(clouds)
     if not clouds:
         raise InputError("imitate_batch(): there are no clouds; expected at least one")
-    reference = demonstration if isinstance(demonstration, Reference) else describe(model, demonstration)
+    target_points, target_model = (settings.get(name) for name in ("target_points", "target_model"))
+    reference = reference_of("imitate_batch()", model, demonstration, target_points, target_model)
     return [
         imitate(model, reference, points, key=jax.random.fold_in(key, index), **settings)
         for index, points in enumerate(clouds)

@@ -22,7 +22,7 @@ from tdf_jax.energy.reference import Contact, Reference, describe
 from tdf_jax.energy.residual import pick_residual
 from tdf_jax.energy.seating import touch_distance
 from tdf_jax.geometry import se3
-from tdf_jax.geometry.demonstration import Demonstration
+from tdf_jax.geometry.demonstration import Demonstration, check_apart
 from tdf_jax.geometry.trajectory import Trajectory, resample
 from tdf_jax.geometry.transport import arrival_depth, carry_to_target
 from tdf_jax.networks.encoding import encode
@@ -72,7 +72,7 @@ class Relations:
         object_contacts: poses X_o of the contact frame on the object in its initial pose, world frame, (solutions, 7).
         energies: sum of the descriptor energies of both, (solutions,).
         seatings: displacements of the object after both regions are brought together, so that it touches the target,
-            world frame, (solutions, 3), metres; zero where it is not seated.
+            world frame, (solutions, 3), metres; NaN where it is not seated.
         target_residual: residual of the best contact pose on the target; NaN if the target has not moved.
     """
 
@@ -86,7 +86,7 @@ class Relations:
     def motions(self) -> Float[Array, "solutions 7"]:
         """Motions M of the object: a point x of it in its initial pose ends at M x."""
         together = se3.compose(jnp.asarray(self.target_contacts), se3.inverse(jnp.asarray(self.object_contacts)))
-        return together.at[:, 4:].add(jnp.asarray(self.seatings))
+        return together.at[:, 4:].add(jnp.asarray(np.nan_to_num(self.seatings)))
 
 
 @host
@@ -127,6 +127,9 @@ def relate(
     checks.key("relate()", key)
     reference = reference_of("relate()", model, demonstration, target_points, target_model)
     checks.boolean("relate()", "seat", seat)
+    if not isinstance(config, CarryConfig):
+        raise InputError(f"relate(): config is {config!r}; expected a CarryConfig")
+    check_scene("relate()", points, target_points, reference)
     field = target_field(model, reference, target_points, target_model)
     objects = Objects(points, target_points, encode(model, points), field)
     return find_relations("relate()", objects, reference, key, config, seat).motions[0]
@@ -186,6 +189,22 @@ def target_field(
     if target_model is None or reference.contact is None:
         return None
     return encode(target_model, reference.contact.target_points)
+
+
+def check_scene(function: str, points, target_points, reference: Reference) -> None:
+    """Check that object and target are two objects.
+
+    Args:
+        function: name that error messages begin with.
+        points: point cloud of the new object, (points, 3), metres, world frame.
+        target_points: point cloud of the new target, (points, 3); None if the demonstrated one has not moved.
+        reference: the demonstration.
+
+    Raises:
+        InputError: the clouds show the same points or surface.
+    """
+    if reference.contact is not None:
+        check_apart(function, points, reference.contact.target_points if target_points is None else target_points)
 
 
 def find_relations(
@@ -248,14 +267,13 @@ def find_relations(
     energies = target_energies[:, None] + object_energies
     order = np.argsort(energies, axis=None, kind="stable")[:MAX_SOLUTIONS]
     rows, columns = np.unravel_index(order, energies.shape)
-    found = Relations(
-        on_target[rows], on_object[columns], energies[rows, columns], np.zeros((len(rows), 3), np.float32), residual
-    )
+    unseated = np.full((len(rows), 3), np.nan, np.float32)
+    found = Relations(on_target[rows], on_object[columns], energies[rows, columns], unseated, residual)
     return dataclasses.replace(found, seatings=_seatings(objects, found, contact)) if seat else found
 
 
 def _seatings(objects: Objects, found: Relations, contact: Contact) -> Float[np.ndarray, "solutions 3"]:
-    """Displacements of the placed object until it touches the target; zero where it does not."""
+    """Displacements of the placed object until it touches the target; NaN where it does not."""
     if not abs(float(contact.touch)) <= MOST_TOUCH:  # also where it is not known
         return found.seatings
     target_points = contact.target_points if objects.target_points is None else objects.target_points
@@ -265,7 +283,7 @@ def _seatings(objects: Objects, found: Relations, contact: Contact) -> Float[np.
         touch_distance(objects.field, objects.target, objects.points, target_points, motion, direction)
         for motion, direction in zip(found.motions, directions, strict=True)
     ]
-    return (np.nan_to_num(distances)[:, None] * directions).astype(np.float32)
+    return (np.array(distances)[:, None] * directions).astype(np.float32)
 
 
 def distinct_contacts(
@@ -372,6 +390,7 @@ def carry_object(
         candidate_history=jnp.asarray(picked.candidate_history)[rows],
         target_trajectories=jnp.asarray(relations.target_contacts[columns][:, None]),
         target_residual=np.asarray(relations.target_residual, np.float32),
+        seatings=relations.seatings[columns],
     )
     return with_ends(result, reference)
 

@@ -142,7 +142,21 @@ def test_a_shared_reference_gives_the_same(small_model, related, moved, result):
         tdf.imitate(small_model, plain, moved[0], target_points=moved[1], key=KEY, config=SEARCH)
 
 
+def test_a_batch_shares_the_target(small_model, related, moved, result):
+    options = {"target_points": moved[1], "config": SEARCH}
+    (one,) = tdf.imitate_batch(small_model, related, [moved[0]], key=KEY, **options)
+    alone = tdf.imitate(small_model, related, moved[0], key=jax.random.fold_in(KEY, 0), **options)
+    np.testing.assert_array_equal(one.trajectories, alone.trajectories)
+
+
 # The path between
+
+
+def test_a_path_that_does_not_move_ends_at_the_goal():
+    poses = np.tile(random_poses(40, 1), (5, 1))
+    pick, goal, motion = (jnp.asarray(pose) for pose in random_poses(41, 3))
+    found = carried_path(tdf.Trajectory(jnp.asarray(poses)), pick, goal, motion).wxyz_xyz
+    np.testing.assert_allclose(matrices(found[jnp.array([0, -1])]), matrices(jnp.stack([pick, goal])), atol=1e-5)
 
 
 def test_a_path_leaves_upwards_and_arrives_as_demonstrated_relative_to_the_target():
@@ -182,6 +196,25 @@ def test_a_target_that_moved_with_the_object_moves_the_whole_path(upright):
 
 
 # Contact points and bad input
+
+
+def test_two_clouds_of_one_object_are_no_object_and_target(small_model, related, moved):
+    rng = np.random.default_rng(0)
+    ball = rng.normal(size=(800, 3))
+    ball = 0.05 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
+    with pytest.raises(InputError, match=r"relate\(\): the object's points lie on the target's surface"):
+        tdf.relate(small_model, related, points=ball[:400], target_points=ball[400:], key=KEY, config=SEARCH)
+    with pytest.raises(InputError, match=r"relate\(\): config is .*; expected a CarryConfig"):
+        tdf.relate(small_model, related, points=moved[0], target_points=moved[1], key=KEY, config=tdf.SolveConfig())
+
+
+def test_the_touch_of_a_traced_demonstration_is_not_known(small_model, related):
+    @jax.jit
+    def touch(poses):
+        demonstration = dataclasses.replace(related, trajectory=tdf.Trajectory(poses))
+        return tdf.describe(small_model, demonstration, target_model=small_model).contact.touch
+
+    assert np.isinf(touch(related.trajectory.wxyz_xyz))
 
 
 def test_contact_points_are_where_two_clouds_meet():

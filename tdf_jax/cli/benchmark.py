@@ -214,7 +214,7 @@ def _relations(out: Path, settings: dict) -> None:
 
 def _draw_failures(out: Path, scores, seed: int) -> None:
     from tdf_jax.cli.pictures import Pictures
-    from tdf_jax.evaluation.relation_report import failures, picture
+    from tdf_jax.evaluation.relation_report import failures, penetration, picture
     from tdf_jax.evaluation.relation_tasks import draw_pair, place_pair
 
     pictures = Pictures("tdf benchmark")
@@ -231,7 +231,7 @@ def _draw_failures(out: Path, scores, seed: int) -> None:
             for one in failed:
                 pair = draw_pair(task, seed, one.number)
                 placement = place_pair(pair, seed, one.condition.poses, one.condition.clouds)
-                lengths = f"gap {1e3 * one.placed.gap:.0f} mm, overlap {1e3 * one.placed.penetration:.0f} mm"
+                lengths = f"gap {1e3 * one.placed.gap:.0f} mm, penetration {penetration(one.placed)} mm"
                 title = f"{one.condition.poses}, {one.condition.clouds}, pair {one.number}\n{lengths}"
                 found, frames = placement.placed(one.motion), (pair.T_target_object, pair.T_target_contact)
                 drawn.append(PlacedMeshes(title, pair.object.mesh, pair.target.mesh, found, *frames))

@@ -108,10 +108,8 @@ def _run(settings: Settings, folder: Path, pictures: Pictures) -> dict:
 
 def _target(settings: Settings, model: Model) -> tuple[Model | None, np.ndarray | None]:
     """Network and points of the new target; None where there is none. `make_task` has the points of a task."""
-    if settings.task is not None:
+    if settings.task is not None or settings.target_object is None:
         return None if settings.target_weights is None else load_model(settings.target_weights), None
-    if settings.target_object is None:
-        return None, None
     points = load_points(
         settings.target_object,
         settings.points,
@@ -336,12 +334,14 @@ def _relation(scene: Scene, task: TaskScene | None, result: Result) -> dict | No
     centroid = scene.points.mean(axis=0)
     judged = not_judged() if task is None else task.judged(result.object_motion)
     moved = pose_error(result.object_motion, np.array([1.0, 0, 0, 0, 0, 0, 0]))[1]
+    seating = np.asarray(result.seatings)[result.best]
     return {
         "object_motion": _plain(result.object_motion),
         "moved_metres": float(np.linalg.norm(motion[:3, :3] @ centroid + motion[:3, 3] - centroid)),
         "moved_radians": float(moved),
         "T_world_contact": _plain(result.target_trajectories[result.best, 0]),
         "target_residual": _plain(float(result.target_residual)),
+        "seating": None if np.isnan(seating).any() else _plain(seating),
         **{name: _plain(value) for name, value in judged.items()},
     }
 

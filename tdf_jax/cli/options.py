@@ -243,11 +243,6 @@ def _resolved_task(settings: Settings) -> Settings:
             f"tdf imitate: --goal-offset is {settings.goal_offset} and --task is {task}; expected none, because the "
             "goal is found on the target; drop one"
         )
-    if known and settings.target_weights is not None:
-        raise InputError(
-            f"tdf imitate: --target-weights is {settings.target_weights} and --target is known; expected none, because "
-            "no region is searched on a target that has not moved; drop it, or take --target found"
-        )
     # A word, and not a file.
     _check_numbers(dataclasses.replace(settings, target=None, target_weights=None))
     relation = RELATIONS[task]
@@ -256,11 +251,14 @@ def _resolved_task(settings: Settings) -> Settings:
         target=Path("known" if known else "found"),
         category=cast(Category, relation.object),
         weights=settings.weights or _shipped(task, relation.object, "--weights"),
-        target_weights=None
-        if known
-        else settings.target_weights or _shipped(task, relation.target, "--target-weights"),
+        target_weights=settings.target_weights or _target_weights(task, relation.target, known),
         target_pose=settings.target_pose or "random",
     )
+
+
+def _target_weights(task: str, category: str, known: bool) -> str | None:
+    """Weights of a task's target; a target that has not moved needs none, and is seated on the better with some."""
+    return None if known and category not in available_models() else _shipped(task, category, "--target-weights")
 
 
 def _shipped(task: str, category: str, option: str) -> str:
@@ -294,8 +292,10 @@ def _check_numbers(settings: SceneSettings) -> None:
             raise InputError(
                 "tdf imitate: --target-object needs a --demonstration with a target; give one, see tdf demonstrate"
             )
-        if settings.target_weights is not None and settings.target_object is None:
-            raise InputError("tdf imitate: --target-weights is for a --target-object or a --task; give one, or drop it")
+        if settings.target_weights is not None and settings.demonstration is None:
+            raise InputError(
+                "tdf imitate: --target-weights is for a --demonstration with a target or a --task; give one, or drop it"
+            )
     if isinstance(settings, LandscapeSettings):
         for name in ("half", "radius", "pitch"):
             checks.positive("tdf landscape", f"--{name}", getattr(settings, name), "metres")

@@ -212,8 +212,10 @@ def _contact(demonstrations, fields, target_model, combine) -> Contact | None:
 def _touch(demonstrations, fields, target_fields) -> float:
     """How far down the demonstrated objects touch their targets, the median; infinite if one does not or is traced."""
     scenes = list(zip(demonstrations, fields, target_fields, strict=True))
-    if any(checks.traced(*jax.tree.leaves((demo.points, demo.target.points, field))) for demo, field, _ in scenes):
-        return np.inf
+    for demo, *fields_of_both in scenes:
+        values = demo.points, demo.trajectory.wxyz_xyz, demo.target.points, demo.target.T_world_contact, fields_of_both
+        if checks.traced(*jax.tree.leaves(values)):
+            return np.inf
     down = np.array([0.0, 0.0, -1.0])
     distances = [
         touch_distance(field, target, demo.points, demo.target.points, demo.object_motion, down)
@@ -232,7 +234,7 @@ def _combined(several: list[Array], combine: str) -> Array:
 def _relative(wxyz_xyz, origin) -> Array:
     """Poses relative to an origin; the difference is taken in float64 where the numbers are known."""
     if checks.traced(wxyz_xyz, origin):
-        return Trajectory(wxyz_xyz).shifted(-origin).wxyz_xyz
+        return Trajectory(jnp.asarray(wxyz_xyz)).shifted(-origin).wxyz_xyz
     poses = np.asarray(wxyz_xyz)
     offset = np.concatenate([np.zeros(4), np.asarray(origin, np.float64)])
     return jnp.asarray((poses - offset).astype(jax.dtypes.canonicalize_dtype(poses.dtype)))

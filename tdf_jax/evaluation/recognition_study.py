@@ -142,6 +142,7 @@ def summary(
     right: Float[np.ndarray, " cases"],
     numbers: Int[np.ndarray, " cases"],
     curve: Float[np.ndarray, "3"],
+    by_size: bool = True,
 ) -> dict:
     """The area under the ROC of a curve and of the residual alone, and rates at all `LEVELS`, by size too.
 
@@ -150,6 +151,7 @@ def summary(
         right: 1 for right cases, (cases,).
         numbers: numbers of the cases, (cases,).
         curve: intercept and both slopes, (3,).
+        by_size: whether half of the objects have the common size of their category.
     """
     intercept, slope, logit_slope = map(float, curve)
     predicted = np.array(
@@ -160,9 +162,11 @@ def summary(
     kinds = numbers % len(CLOUDS)
     by_cloud = {name: ranking(predicted[kinds == kind], right[kinds == kind]) for kind, name in enumerate(CLOUDS)}
     sizes = {"common": ~natural, "natural": natural}
-    by_size = {name: _rates(predicted[these], right[these]) for name, these in sizes.items() if these.any()}
-    thresholds = {"thresholds": _rates(predicted, right), "thresholds_by_size": by_size}
-    return {"cases": len(right), **areas, "area_by_cloud": by_cloud, **thresholds}
+    record = {"cases": len(right), **areas, "area_by_cloud": by_cloud, "thresholds": _rates(predicted, right)}
+    if by_size:
+        rates = {name: _rates(predicted[these], right[these]) for name, these in sizes.items() if these.any()}
+        record["thresholds_by_size"] = rates
+    return record
 
 
 def _rates(predicted: np.ndarray, right: np.ndarray) -> dict:
@@ -186,9 +190,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--weights", default="mug", help="a name of shipped weights, or a .safetensors file")
     parser.add_argument(
-        "--category", choices=list(FAMILIES), nargs="+", default=["mug"], help="categories of the demonstrations"
+        "--weights", default=None, help="a name of shipped weights, or a .safetensors file (default: mug)"
+    )
+    parser.add_argument(
+        "--category",
+        choices=list(FAMILIES),
+        nargs="+",
+        default=None,
+        help="categories of the demonstrations (default: mug)",
     )
     parser.add_argument(
         "--task", choices=list(RELATIONS), help="recognise the targets of a relation; the weights are those of the task"
@@ -202,8 +212,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     if options.count < 1:
         parser.error(f"--count is {options.count}; expected at least 1")
+    if options.task is not None and (options.weights is not None or options.category is not None):
+        parser.error("--task has weights and categories of its own; drop --weights and --category")
     if options.task is None:
-        model, curves, names = load_model(options.weights), CURVES, options.category
+        model, curves, names = load_model(options.weights or "mug"), CURVES, options.category or ["mug"]
         cases = [functools.partial(evidence, model, name, options.seed) for name in names]
     else:
         relation, curves, names = RELATIONS[options.task], TARGET_CURVES, [options.task]
@@ -215,8 +227,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows, right, numbers = (np.concatenate(column) for column in zip(*parts))
     curve = logistic(features(rows), right) if options.fit else np.array(curves[model.info.name])
     settings = {name: value for name, value in vars(options).items() if name != "out"}
-    record = header(settings, model) | {"curve": [float(x) for x in curve]} | summary(rows, right, numbers, curve)
-    record["categories"] = {name: summary(*part, curve) for name, part in zip(names, parts)}
+    record = (
+        header(settings, model)
+        | {"curve": [float(x) for x in curve]}
+        | summary(rows, right, numbers, curve, options.task is None)
+    )
+    record["categories"] = {name: summary(*part, curve, options.task is None) for name, part in zip(names, parts)}
     print(json.dumps(record, indent=1))
     if options.out is not None:
         write_record("recognition_study", options.out, record)

@@ -16,6 +16,9 @@ from tdf_jax.geometry.trajectory import Trajectory, check_trajectory, resample
 # Diagonals of the cloud. Query points far from the object are legitimate, but their descriptors fade with the distance
 # (figure 3 of the paper); a wrong unit is a factor of 39 or more.
 LARGEST_QUERY, FARTHEST_QUERY = 10.0, 10.0
+# Two clouds show one surface if more than this share of the points of each is within so many spacings of the other's.
+SAME_SURFACE, SPACINGS = 0.5, 1.0
+COMPARED = 1000  # points of each cloud that are compared
 SAME_POINT = 1e-5  # metres within which a point of the object is one of the target, and not only close to it
 
 
@@ -179,7 +182,7 @@ class Demonstration:
 
 
 def check_apart(function: str, points, target_points) -> None:
-    """Check that the clouds of object and target do not show the same points.
+    """Check that the clouds of object and target do not show the same points or the same surface.
 
     Args:
         function: name that the message begins with.
@@ -187,7 +190,8 @@ def check_apart(function: str, points, target_points) -> None:
         target_points: point cloud of the target, (points, 3), metres.
 
     Raises:
-        InputError: more than a tenth of the object's points are points of the target.
+        InputError: more than a tenth of the object's points are points of the target, or most of the points of each
+            are as near to the other as its own points are to each other.
     """
     if checks.traced(points, target_points):
         return
@@ -198,6 +202,25 @@ def check_apart(function: str, points, target_points) -> None:
             f"{function}: {shared} of the {len(cloud)} points of the object are points of the target too; expected two "
             "clouds without common points: cut the object out of the target's cloud"
         )
+    sparse, other = (_sparse(np.asarray(one, np.float64)) for one in (points, target_points))
+    if min(_share_on(sparse, other), _share_on(other, sparse)) > SAME_SURFACE:
+        raise InputError(
+            f"{function}: the object's points lie on the target's surface, and the target's on the object's; expected "
+            "clouds of two objects that do not overlap: check that the second is not the object's own"
+        )
+
+
+def _sparse(cloud: np.ndarray) -> np.ndarray:
+    return cloud[:: -(-len(cloud) // COMPARED)]
+
+
+def _share_on(cloud: np.ndarray, surface: np.ndarray) -> float:
+    """Share of a cloud's points that are as near to a surface's points as these are to each other."""
+    from scipy.spatial import KDTree
+
+    tree = KDTree(surface)
+    spacing = np.median(np.asarray(tree.query(surface, k=2)[0])[:, 1])
+    return float(np.mean(np.asarray(tree.query(cloud)[0]) < SPACINGS * spacing))
 
 
 def _cells(cloud: np.ndarray) -> np.ndarray:

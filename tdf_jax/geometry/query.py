@@ -15,6 +15,8 @@ from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import public
 from tdf_jax._internal.errors import InputError
 
+FARTHEST_MEETING = 0.25  # largest distance of two clouds that meet, share of the larger diagonal
+
 
 @public
 def box_query(
@@ -136,8 +138,8 @@ def contact_query(
         Query points, (count, 3), metres, world frame: contact points for a target whose contact frame is the world.
 
     Raises:
-        InputError: a cloud is not a point cloud, the clouds are farther apart than either is large, count is below 1,
-            or spread is not above 0.
+        InputError: a cloud is not a point cloud, the clouds are farther apart than a quarter of the larger one's
+            diagonal, count is below 1, or spread is not above 0.
     """
     from scipy.spatial import KDTree
 
@@ -153,7 +155,7 @@ def contact_query(
     to_a, in_a = (np.asarray(part) for part in trees[0].query(b))
     distance = np.concatenate([to_b, to_a])
     extent = max(np.linalg.norm(np.ptp(a, axis=0)), np.linalg.norm(np.ptp(b, axis=0)))
-    if distance.min() > extent:
+    if distance.min() > FARTHEST_MEETING * extent:
         raise InputError(
             f"contact_query(): the clouds are {distance.min():.3g} m apart; expected them to meet. Move the object's "
             "cloud by its motion from the grasp to the release"

@@ -13,7 +13,7 @@ from tdf_jax.geometry import se3
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 # Largest distance of the contact points from the cloud, its diagonals. Descriptors fade with the distance.
-FARTHEST_CONTACT = 1.0
+FARTHEST_CONTACT = 0.25
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +60,7 @@ def check_contact(function: str, what: str, cloud: np.ndarray, query: np.ndarray
         T_world_contact: pose of the contact frame, `wxyz_xyz`, (7,), in the frame of the cloud.
 
     Raises:
-        InputError: the nearest contact point is farther away than a diagonal of the cloud.
+        InputError: the nearest contact point is farther away than a quarter of the cloud's diagonal.
     """
     contact = np.asarray(se3.transform(jnp.asarray(T_world_contact), jnp.asarray(query)))
     # The distance to the bounding box is at most that to the cloud, and quick for large clouds.

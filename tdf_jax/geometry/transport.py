@@ -20,6 +20,7 @@ NEAR = 0.05  # metres from the target within which an object repeats its demonst
 BEYOND = 0.02  # metres that the arrival begins before it comes so near
 ASIDE = 0.02  # metres beside an object within which its target stands in its way
 SPARSE = 300  # points of the object's cloud by which its distance is measured
+STILL = 1e-6  # metres; a shorter path does not move
 MAX_ENDS = 0.8  # largest share of the path that both take: the rest blends the two, without a jump between poses
 
 
@@ -109,6 +110,8 @@ def carry_to_target(
     at_target = se3.compose(se3.compose(jnp.asarray(target_motion), relative), se3.inverse(jnp.asarray(target_motion)))
     arriving = se3.compose(at_target, jnp.asarray(goal))
     steps = jnp.linalg.norm(jnp.diff(poses[:, 4:], axis=0), axis=1)
+    # A path that does not move, such as a rotation in place, has its poses evenly apart.
+    steps = jnp.where(jnp.sum(steps) > STILL, steps, (departure + arrival) / max(1, len(poses) - 1))
     length = jnp.concatenate([jnp.zeros(1, steps.dtype), jnp.cumsum(steps)])
     total = jnp.maximum(length[-1], 1e-9)
     share = jnp.minimum(1.0, MAX_ENDS * total / (departure + arrival))

@@ -22,6 +22,10 @@ def _no_contacts() -> np.ndarray:
     return np.zeros((0, 1, 7), np.float32)
 
 
+def _no_seatings() -> np.ndarray:
+    return np.zeros((0, 3), np.float32)
+
+
 def _unknown() -> np.ndarray:
     return np.full((), np.nan, np.float32)
 
@@ -41,6 +45,7 @@ def _unknown() -> np.ndarray:
         "target_trajectories",
         "target_residual",
         "target_confidence",
+        "seatings",
     ],
     meta_fields=["grasp", "release"],
 )
@@ -76,6 +81,8 @@ class Result:
             scalar, NaN if the target has not moved.
         target_confidence: probability that the contact pose on the target is right; a scalar, NaN where it is not
             calibrated.
+        seatings: displacement of the placed object by which it touches its target, world frame, (candidates, 3),
+            metres; NaN where it was not seated, see `imitate`. No candidates unless the demonstration has a target.
         grasp: index of the pose at which the object is grasped; poses before it are the approach.
         release: index of the pose at which it is released, from the end: -1 unless there is a retreat.
     """
@@ -93,6 +100,7 @@ class Result:
     )
     target_residual: Float[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_unknown)
     target_confidence: Float[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_unknown)
+    seatings: Float[Array | np.ndarray, "*batch targets 3"] = dataclasses.field(default_factory=_no_seatings)
     grasp: int = 0
     release: int = -1
 

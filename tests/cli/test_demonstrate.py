@@ -111,7 +111,7 @@ def inverse(pose):
     ("words", "message"),
     [
         (["--target-object", "shelf.npy"], "--target-object needs a --demonstration with a target"),
-        (["--target-weights", "mug"], "--target-weights is for a --target-object"),
+        (["--target-weights", "mug"], "--target-weights is for a --demonstration with a target"),
     ],
 )
 def test_options_of_a_target_need_one(capsys, words, message):
