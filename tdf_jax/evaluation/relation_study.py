@@ -18,11 +18,13 @@ from tdf_jax.evaluation.relation_success import signed_distances
 from tdf_jax.evaluation.relation_tasks import POSES, RELATIONS, Placement, demonstrate, draw_pair, moved, place_pair
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
+from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.geometry.trajectory import Trajectory, resample
 from tdf_jax.geometry.transport import ARRIVAL, arrival_depth, arrival_of, carry_to_target, carry_trajectory
 from tdf_jax.networks.checkpoint import load_model
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.model import Model
+from tdf_jax.shapes import Shape
 
 SEED = 300  # a development seed
 FIRST_DEMONSTRATION = 1000  # pairs from here on demonstrate
@@ -30,7 +32,7 @@ INSIDE = 0.002  # metres inside the target at which a path counts as colliding
 NEAR = 0.02  # metres around the target's box within which points of the object are measured
 LAST = 0.03  # metres at the end of a path whose direction is compared
 WAYPOINTS = 60  # of each path
-POINTS = 800  # corners of the object's mesh that are carried
+POINTS = 800  # surface points of each object that are tested, and as many corners of its mesh
 BESIDE = 0.15  # metres from where the object stood within which its support counts
 # Low and high corners of a gripper's hand in the frame of the place that it picks, metres; its fingers are below.
 HAND = (-0.04, -0.02, 0.02), (0.04, 0.02, 0.12)
@@ -68,10 +70,11 @@ class Measured(NamedTuple):
     """What a path does between the pick and the goal.
 
     Attributes:
-        clearance: smallest signed distance of the carried object from the target's surface, metres, at most `NEAR`.
-        gripper: that of a gripper's box.
-        support: how far the carried object dips below the horizontal plane that it stood on, within `BESIDE` of where
-            it stood, metres.
+        clearance: smallest signed distance of points of the carried object from the target's surface, or of the
+            target's points from the object's, metres, at most `NEAR`.
+        gripper: that of points of a gripper's hand from the target's surface.
+        support: how far the carried object or the hand dips below the horizontal plane that the object stood on, within
+            `BESIDE` of where it stood, metres.
         approach: angle between the last `LAST` of the path and the demonstrated approach, degrees.
     """
 
@@ -119,8 +122,14 @@ def paths(task: str, poses: str, number: int, seed: int = SEED) -> dict[str, Mea
         "departure upwards": stretched(),
     }
     approach = -pair.T_target_contact[:3, 0] if task == "mug_on_rack" else np.array([0.0, 0.0, -1.0])
-    corners = pair.object.mesh.vertices[:: max(1, len(pair.object.mesh.vertices) // POINTS)]
-    return {name: _measured(placement, grasp, one, corners, approach) for name, one in warped.items()}
+    samples = _samples(pair.object), _samples(pair.target)
+    return {name: _measured(placement, grasp, one, samples, approach) for name, one in warped.items()}
+
+
+def _samples(shape: Shape) -> Float[np.ndarray, "points 3"]:
+    """Points all over a surface, and some of its corners, which are what touches first."""
+    corners = shape.mesh.vertices[:: max(1, len(shape.mesh.vertices) // POINTS)]
+    return np.concatenate([sample_surface(shape.mesh, POINTS, np.random.default_rng(0)), corners])
 
 
 def _nearness(demonstration: Demonstration, path: Trajectory) -> Array:
@@ -142,18 +151,26 @@ def _nearness(demonstration: Demonstration, path: Trajectory) -> Array:
     return jnp.asarray(left / np.maximum(left + gaps, 1e-9), jnp.float32)
 
 
-def _measured(placement: Placement, grasp, path: Trajectory, corners, approach) -> Measured:
-    T_world_gripper, target = np.asarray(path.matrices, float), placement.pair.target
+def _measured(placement: Placement, grasp, path: Trajectory, samples, approach) -> Measured:
+    T_world_gripper, one, target = np.asarray(path.matrices, float), placement.pair.object, placement.pair.target
     T_world_object = T_world_gripper @ np.linalg.inv(grasp)
     there = np.linalg.inv(placement.T_world_target)
-    object_points = np.stack([moved(corners, T) for T in T_world_object])
+    T_target_object = there @ T_world_object
+    object_points, hand = (
+        np.stack([moved(points, T) for T in poses])
+        for points, poses in ((samples[0], T_world_object), (_gripper_box(), T_world_gripper))
+    )
     low, middle = object_points[0, :, 2].min(), object_points[0].mean(axis=0)
-    beside = np.linalg.norm(object_points[..., :2] - middle[:2], axis=2) < BESIDE
+    both = np.concatenate([object_points, hand], axis=1)
+    beside = np.linalg.norm(both[..., :2] - middle[:2], axis=2) < BESIDE
+    # Points of either in the other: a thin peg may cross a wall between the wall's points.
+    inside = [_clearance(target, moved(points, there)) for points in object_points[BEFORE:-1]]
+    inside += [_clearance(one, moved(samples[1], np.linalg.inv(T))) for T in T_target_object[BEFORE:-1]]
     return Measured(
-        min(_clearance(target, moved(points, there)) for points in object_points[BEFORE:-1]),
-        min(_clearance(target, moved(_gripper_box(), there @ T)) for T in T_world_gripper[BEFORE:-1]),
-        float(low - object_points[..., 2][beside].min()),
-        _angle((there @ T_world_object)[:, :3, 3], approach),
+        min(inside),
+        min(_clearance(target, moved(points, there)) for points in hand[BEFORE:-1]),
+        float(low - both[..., 2][beside].min()),
+        _angle(T_target_object[:, :3, 3], approach),
     )
 
 
