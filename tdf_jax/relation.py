@@ -40,7 +40,7 @@ SPACING = 0.01  # metres between poses to a target: with fewer poses the path wo
 MAX_POSES = 200  # of a path that is made denser; one of more than 2 m has wider spacing, so that results stay small
 # Largest distance from touch in the demonstration, metres. Beyond it the object does not rest on the target, and is not
 # seated.
-MOST_TOUCH = 0.01
+MAX_TOUCH_DISTANCE = 0.01
 MAX_SOLUTIONS = 25  # candidates of a result: distinct picks times distinct motions of the object
 
 
@@ -274,7 +274,7 @@ def find_relations(
 
 def _seatings(objects: Objects, found: Relations, contact: Contact) -> Float[np.ndarray, "solutions 3"]:
     """Displacements of the placed object until it touches the target; NaN where it does not."""
-    if not abs(float(contact.touch)) <= MOST_TOUCH:  # also where it is not known
+    if not abs(float(contact.touch)) <= MAX_TOUCH_DISTANCE:  # also where it is not known
         return found.seatings
     target_points = contact.target_points if objects.target_points is None else objects.target_points
     rotations = se3.rotation(jnp.asarray(found.target_contacts))

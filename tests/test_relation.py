@@ -11,6 +11,8 @@ from conftest import QUERIES, carried, composed, random_cloud, random_poses
 
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
+from tdf_jax.evaluation.relation_success import judge
+from tdf_jax.evaluation.relation_tasks import demonstrate, draw_pair, place_pair
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.transport import BEYOND, NEAR, arrival_depth, arrival_of, carry_to_target
 from tdf_jax.uncertainty.calibration import TARGET_CURVES
@@ -313,3 +315,14 @@ def test_into_a_deeper_target_the_object_comes_from_farther_out():
     outward = (deep - plain)[arriving][0, 4:]
     straight = plain[arriving][0, 4:] - plain[-1, 4:]
     assert outward @ straight > 0.999 * np.linalg.norm(outward) * np.linalg.norm(straight)
+
+
+@pytest.mark.slow
+def test_the_shipped_weights_place_an_unseen_bowl_on_an_unseen_mug():
+    bowl, mug = tdf.load_model("bowl"), tdf.load_model("mug")
+    shown, pair = (draw_pair("bowl_on_mug", 901, number) for number in (1000, 0))
+    placement = place_pair(pair, 901, "tilt60")
+    clouds = {"points": placement.points, "target_points": placement.target_points}
+    motion = tdf.relate(bowl, demonstrate(shown, 901), **clouds, target_model=mug, key=KEY)
+    placed = judge(pair, placement.placed(matrices(motion)[0].astype(float)))
+    assert placed.holds() and placed.tilt < 5

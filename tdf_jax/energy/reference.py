@@ -129,7 +129,7 @@ def describe(
             "median", which minimises the sum of absolute differences of eq. 2 (docs/results/benchmark.md compares
             them).
         target_model: network that encodes the targets of the demonstrations, such as `model` itself; None leaves them
-            out, which does for a target that has not moved.
+            out, which is enough for a target that has not moved.
 
     Returns:
         The reference.
