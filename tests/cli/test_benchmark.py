@@ -554,7 +554,7 @@ def test_relations_are_measured_and_reported(tmp_path, capsys):
         (("--pairs", "0"), "--pairs is 0"),
         (("--seed", "-1"), "--seed is -1"),
         (("--target-weights", "mug"), "--tasks need weights of container, mug, rack; expected tasks of one category"),
-        (("--tasks", "mug_on_rack"), "there are no weights 'rack'"),
+        (("--tasks", "mug_on_rack", "--target-weights", "rake"), "there are no weights 'rake'"),
     ],
 )
 def test_bad_relations_are_refused(words, message, tmp_path, capsys):
