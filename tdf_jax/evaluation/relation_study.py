@@ -219,7 +219,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             found = 1e3 * touches(task, one, other, clouds, settings.pairs)
             print(
                 f"{task}, {clouds}: touch within 2 mm of {np.mean(np.abs(found) < 2):.0%}, median "
-                f"{np.nanmedian(found):.1f} mm, none of {np.isnan(found).sum()}",
+                f"{np.nanmedian(found):.1f} mm, no touch in {np.isnan(found).sum()} pairs",
                 flush=True,
             )
         return
