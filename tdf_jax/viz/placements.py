@@ -47,7 +47,7 @@ def placements_figure(placements: Sequence[PlacedMeshes]) -> Figure:
         placements: the placements, at least one.
     """
     with matplotlib.rc_context(STYLE):
-        figure = blank_figure(COLUMN * len(placements) + 0.2, 2 * ROW + 0.35)
+        figure = blank_figure(COLUMN * len(placements) + 0.2, 2 * ROW + 0.55)
         for column, one in enumerate(placements):
             solids = {"found": one.found, "right": one.true}
             solids = {name: _behind(_solid(one.object, _upright(one) @ T)) for name, T in solids.items()}
@@ -62,10 +62,10 @@ def placements_figure(placements: Sequence[PlacedMeshes]) -> Figure:
                 set_view(axes, (1, 1, 1), 1.75, VIEW)
                 axes.set_axis_off()
                 if row == 0:
-                    axes.set_title(one.title, y=0.9, fontsize=6)
+                    axes.set_title(one.title, y=0.98, fontsize=6)
         figure.text(0.005, 0.72, "found", rotation=90, va="center", fontsize=7)
         figure.text(0.005, 0.26, "right", rotation=90, va="center", fontsize=7)
-        figure.subplots_adjust(left=0.02, right=1, bottom=0.01, top=0.9, wspace=0, hspace=0)
+        figure.subplots_adjust(left=0.02, right=1, bottom=0.01, top=0.87, wspace=0, hspace=0)
     return figure
 
 
