@@ -150,6 +150,7 @@ def perfect(made):
         initial_trajectories=np.zeros((1, 2, 7), np.float32),
         history=np.zeros((1, 2), np.float32),
         target_trajectories=pose(contact)[None, None].astype(np.float32),
+        seatings=np.full((1, 3), np.nan, np.float32),
     )
 
 
@@ -173,7 +174,9 @@ def test_the_record_and_the_table_judge_the_placement(made, weights, tmp_path, m
     record = json.loads((tmp_path / "out" / "result.json").read_text())
     steps = solves * tdf.CarryConfig().solver.num_steps
     assert f"{steps}/{steps}" in error
-    assert (calls[0]["target_points"] is None, calls[0]["target_model"] is None) == (target == "known",) * 2
+    assert (calls[0]["target_points"] is None) == (target == "known")
+    assert calls[0]["target_model"].info.name == ("container" if target == "known" else "small")
+    assert record["relation"]["seating"] is None
     assert record["relation"]["success"] and set(JUDGED) <= set(record["relation"])
     assert record["expected"] is None and record["errors"]["path_metres"] is None
     assert record["errors"]["pick_metres"] < 1e-5 and record["errors"]["pick_radians"] < 1e-2
