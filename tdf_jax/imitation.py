@@ -138,10 +138,14 @@ def _check_target(result: Result, model: Model, objects: Objects) -> None:
         return
     curve, logit = TARGET_CURVES[model.info.name], surface_logit(objects.target, jnp.asarray(objects.target_points))
     recognised = recognition(float(result.target_residual), logit, curve)
+    _warn_of_category("target", recognised, model.info.name, "target_points, their unit and target_model")
+
+
+def _warn_of_category(what: str, recognised: float | None, weights: str, check: str) -> None:
     if recognised is not None and recognised < DOUBT:
         warnings.warn(
-            "imitate(): the target does not look like one of the demonstration's category to the weights "
-            f"{model.info.name!r} (probability {recognised:.2g}); check target_points, their unit and target_model",
+            f"imitate(): the {what} does not look like one of the demonstration's category to the weights "
+            f"{weights!r} (probability {recognised:.2g}); check {check}",
             CategoryWarning,
             stacklevel=caller_level(),
         )
@@ -154,13 +158,7 @@ def _judged(result: Result, weights: str, field, points) -> Result:
         recognised = recognition(float(result.residual), surface_logit(field, points), CURVES[weights])
     if weights in CALIBRATED:
         confident = confidence(float(result.residual))
-    if recognised is not None and recognised < DOUBT:
-        warnings.warn(
-            "imitate(): the object does not look like one of the demonstration's category to the weights "
-            f"{weights!r} (probability {recognised:.2g}); check points, their unit and the weights",
-            CategoryWarning,
-            stacklevel=caller_level(),
-        )
+    _warn_of_category("object", recognised, weights, "points, their unit and the weights")
     if confident is not None and confident < DOUBT and (recognised is None or recognised >= DOUBT):
         warnings.warn(
             f"imitate(): the pick is right with a probability of {confident:.2g} only. Check that the cloud shows the "

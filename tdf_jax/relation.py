@@ -129,9 +129,9 @@ def relate(
     checks.boolean("relate()", "seat", seat)
     if not isinstance(config, CarryConfig):
         raise InputError(f"relate(): config is {config!r}; expected a CarryConfig")
-    check_scene("relate()", points, target_points, reference)
     field = target_field(model, reference, target_points, target_model)
     objects = Objects(points, target_points, encode(model, points), field)
+    check_scene("relate()", points, target_points, reference)  # after `encode`, which refuses what is no cloud
     return find_relations("relate()", objects, reference, key, config, seat).motions[0]
 
 

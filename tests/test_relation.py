@@ -206,6 +206,8 @@ def test_two_clouds_of_one_object_are_no_object_and_target(small_model, related,
     ball = 0.05 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
     with pytest.raises(InputError, match=r"relate\(\): the object's points lie on the target's surface"):
         tdf.relate(small_model, related, points=ball[:400], target_points=ball[400:], key=KEY, config=SEARCH)
+    with pytest.raises(InputError, match="points"):  # no traceback of what compares the clouds
+        tdf.relate(small_model, related, points=ball[:400, :2], target_points=ball[400:], key=KEY, config=SEARCH)
     with pytest.raises(InputError, match=r"relate\(\): config is .*; expected a CarryConfig"):
         tdf.relate(small_model, related, points=moved[0], target_points=moved[1], key=KEY, config=tdf.SolveConfig())
 

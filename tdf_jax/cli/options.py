@@ -257,7 +257,7 @@ def _resolved_task(settings: Settings) -> Settings:
 
 
 def _target_weights(task: str, category: str, known: bool) -> str | None:
-    """Weights of a task's target; a target that has not moved needs none, and is seated on the better with some."""
+    """Weights of a task's target; one that has not moved needs none, but with some, the object is seated by both shapes."""
     return None if known and category not in available_models() else _shipped(task, category, "--target-weights")
 
 

@@ -15,7 +15,7 @@ NEIGHBOURS = 4  # points half way to the nearest neighbours are tested too: few 
 BESIDE = 0.01  # metres across the direction within which a point may meet the other object
 SIDEWAYS = 2.0  # weight of the distance across the direction when those points are chosen
 POINTS = 512  # points of each object that are tested
-CLOUD = 2000  # points of each cloud that are looked at; more cost time and memory, and change nothing
+CLOUD = 2000  # points of each cloud that are looked at; more cost time and memory
 PADDING = 128  # the points are filled up to a multiple of it, so that few programs are compiled
 
 
