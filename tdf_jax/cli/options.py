@@ -257,7 +257,7 @@ def _resolved_task(settings: Settings) -> Settings:
 
 
 def _target_weights(task: str, category: str, known: bool) -> str | None:
-    """Weights of a task's target; one that has not moved needs none, but with some, the object is seated by both shapes."""
+    """Weights of a task's target. One that has not moved needs none; with some, both shapes seat the object."""
     return None if known and category not in available_models() else _shipped(task, category, "--target-weights")
 
 
