@@ -48,7 +48,7 @@ def retime(
             squared.
         rate: samples per second, hertz.
         deviation: largest distance of the path from the straight lines between the waypoints, radians, as the norm
-            over all joints. A smaller one makes the robot slower at corners.
+            over all joints, at least 1e-5.
 
     Returns:
         Times of the samples, (samples,), seconds from 0, evenly spaced, and joint positions, (samples, joints),
@@ -137,13 +137,14 @@ def _toppra(function: str) -> Any:
 
 def _distinct(waypoints: np.ndarray) -> np.ndarray:
     """The waypoints without those that coincide with the one before; the first and the last stay."""
-    chosen = [0]
+    chosen, last = [0], waypoints[-1]
     for index in range(1, len(waypoints)):
         if np.linalg.norm(waypoints[index] - waypoints[chosen[-1]]) > COINCIDENT:
             chosen.append(index)
-    if len(chosen) > 1:
-        chosen[-1] = len(waypoints) - 1  # within 1e-6 rad of the one that it replaces
-    return waypoints[chosen]
+    while len(chosen) > 1 and np.linalg.norm(last - waypoints[chosen[-1]]) <= COINCIDENT:
+        chosen.pop()
+    moves = np.linalg.norm(last - waypoints[chosen[-1]]) > COINCIDENT
+    return np.concatenate([waypoints[chosen], last[None]]) if moves else waypoints[chosen]
 
 
 def _path(waypoints: np.ndarray, deviation: float):
@@ -200,8 +201,8 @@ def _speeds(toppra, path, grid: np.ndarray, velocity: np.ndarray, acceleration: 
     usable = speeds is not None and np.isfinite(speeds).all() and (speeds[1:] + speeds[:-1] > 0).all()
     if code != toppra.algorithm.ParameterizationReturnCode.Ok or not usable:
         raise InputError(
-            f"retime(): TOPP-RA found no timing of the path of {length:.4g} rad ({code.value}); expected waypoints that "
-            "a robot can follow within the limits. Remove waypoints that jump or repeat, and check the limits"
+            f"retime(): TOPP-RA found no timing of the path of {length:.4g} rad ({code.value}); expected waypoints "
+            "that a robot can follow within the limits. Remove waypoints that jump or repeat, and check the limits"
         )
     return speeds * length / second
 
