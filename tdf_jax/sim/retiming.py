@@ -19,6 +19,8 @@ PLACES = np.arange(1, 8) / 8  # of each interval, where the deviation is measure
 ROUNDS = 40  # of halving intervals; a corner of 1 mrad between waypoints 10 rad apart needs about 12
 GRID_STEP = 0.02  # radians between the places where the limits enter, at most
 GRID_POINTS = 100  # of such places, at least
+REFINEMENTS = 5  # of the grid, at most
+TOLERATED = 1.01  # factor by which limits may be exceeded between places of the grid before it gets more of them there
 GRID_TURN = 0.1  # radians that the direction of the path turns between such places, at most
 LONGEST = 1e4  # radians of a path; a longer one has a wrong unit
 SLOWEST, FASTEST = 1e-6, 1e6  # limits in radians and seconds; others have a wrong unit
@@ -85,9 +87,15 @@ def retime(
         return np.zeros(1), waypoints
     path = _path(waypoints, float(deviation))
     grid = _grid(path)
-    timing = _timing(path, grid, _speeds(toppra, path, grid, velocity, acceleration))
+    for _ in range(REFINEMENTS):
+        timing = _timing(grid, _speeds(toppra, path, grid, velocity, acceleration))
+        excess = _excess(path, timing, velocity, acceleration)
+        if excess.max() <= TOLERATED:
+            break
+        where = np.flatnonzero(excess > TOLERATED)
+        grid = np.insert(grid, where + 1, (grid[where] + grid[where + 1]) / 2)
     # Between the places of the grid a limit may be exceeded by a little: all of it gets slower by that much.
-    slower = _excess(path, timing, velocity, acceleration)
+    slower = max(1.0, float(excess.max()))
     duration = float(timing.times[-1]) * slower
     count = np.ceil(duration * rate)
     if not count <= MAX_SAMPLES:
@@ -219,7 +227,7 @@ def _quiet() -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _timing(path, arcs: np.ndarray, speeds: np.ndarray) -> _Timing:
+def _timing(arcs: np.ndarray, speeds: np.ndarray) -> _Timing:
     steps = np.diff(arcs)
     times = np.concatenate([[0.0], np.cumsum(2 * steps / (speeds[:-1] + speeds[1:]))])
     return _Timing(arcs, times, speeds, np.diff(speeds**2) / (2 * steps))
@@ -233,13 +241,17 @@ def _arc(timing: _Timing, times: np.ndarray) -> np.ndarray:
     return np.clip(arc, timing.arcs[part], timing.arcs[part + 1])
 
 
-def _excess(path, timing: _Timing, velocity: np.ndarray, acceleration: np.ndarray) -> float:
-    """The factor, at least 1, that the duration needs so that both limits are held everywhere."""
-    fractions = np.linspace(0, 1, 9)[:, None]
+def _excess(path, timing: _Timing, velocity: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
+    """For each part of the grid, the factor by which it must be slower to hold both limits everywhere, (grid - 1,)."""
+    fractions = np.linspace(0, 1, 5)[:, None]
     arcs = timing.arcs[:-1] + fractions * np.diff(timing.arcs)
-    squares = timing.speeds[:-1] ** 2 + fractions * np.diff(timing.speeds**2)
+    squares = (timing.speeds[:-1] ** 2 + fractions * np.diff(timing.speeds**2))[..., None]
     first, second = path(arcs, 1), path(arcs, 2)
-    velocities = first * np.sqrt(squares)[..., None]
-    accelerations = first * timing.accelerations[:, None] + second * squares[..., None]
-    fast = (np.abs(velocities) / velocity).max()
-    return float(max(1.0, fast, np.sqrt((np.abs(accelerations) / acceleration).max())))
+    fast = np.abs(first * np.sqrt(squares) / velocity).max(axis=(0, 2))
+    # Parts are within one cubic, where accelerations are a quadratic function of the path length.
+    start, _, middle, _, end = (first * timing.accelerations[:, None] + second * squares) / acceleration
+    bend, slope = 2 * (start + end - 2 * middle), 4 * middle - 3 * start - end
+    inside = np.abs(slope + bend) < np.abs(bend)  # the extremum at -slope / (2 bend) is between 0 and 1
+    extremum = np.where(inside, start - slope**2 / np.where(inside, 4 * bend, 1), start)
+    steep = np.abs([start, middle, end, extremum]).max(axis=(0, 2))
+    return np.maximum(fast, np.sqrt(steep))
