@@ -19,7 +19,7 @@ from tdf_jax.shapes.solid import Bar, Part, Tube, rings, tube_rings
 _TOLERANCE = 4e-4  # intended distance of the parts' surface from the true one, metres, on either side
 _FINE = 2e-5  # distance by which profiles and outlines are simplified, metres
 _OUTER = 8e-5  # the same for the outside of a wall, whose every corner costs time in contact
-_CORNERS = 60  # most corners of a part
+_CORNERS = 64  # most corners of a part
 _STEP = 1.5e-4  # rings closer than this, metres, are the step of a cap; a part between them would be a needle
 _THINNEST = 3e-4  # thinnest part worth having, metres
 _BUDGETS = np.geomspace(1e-4, 0.3, 48)  # sagittas of a sector to tabulate, shares of the largest radius
@@ -115,64 +115,102 @@ def _body(outer: _Stack, hollows: list[_Stack], low: float, high: float) -> Iter
 
 def _slabs(stack: _Stack) -> Iterator[np.ndarray]:
     """Frusta of a solid body, each as tall as the tolerance allows."""
-    heights, polygons = stack.heights, stack.rings
-    sags = [_sagittas(polygon) for polygon in polygons]
-    upright = _upright(heights, np.linalg.norm(polygons, axis=2))
+    sizes = np.linalg.norm(stack.rings, axis=2).max(axis=1)
+    keep = _simplified(np.column_stack([stack.heights, sizes]), _FINE)
+    keep = np.union1d(keep, np.linspace(0, len(sizes) - 1, 12).astype(int))  # outlines differ at equal sizes
+    heights, polygons, sizes = stack.heights[keep], stack.rings[keep], sizes[keep]
+    slab = _Slab(
+        heights, polygons, [_sagittas(p) for p in polygons], _room(heights, sizes, 1.0), _room(heights, sizes, -1.0)
+    )
     first, last = 0, len(heights) - 1
-    floor = heights[0]  # where the next frustum begins
+    found: list[np.ndarray] = []
+    begin = heights[0]
     while first < last:
-        if heights[first + 1] - heights[first] < _STEP:
-            first += 1
-            continue
         end = first + 1
-        chosen = _frustum(heights, polygons, sags, upright, first, end)[0]
-        while end < last and heights[end + 1] - heights[end] >= _STEP:
-            longer, error = _frustum(heights, polygons, sags, upright, first, end + 1)
-            if error > _TOLERANCE:
+        chosen, error = _frustum(slab, first, end)
+        while end < last:
+            longer, longer_error = _frustum(slab, first, end + 1)
+            if longer_error > _TOLERANCE:
                 break
-            chosen, end = longer, end + 1
-        below = chosen[:, 2] == heights[first]
-        chosen[below, 2] = floor
-        floor = heights[end]
-        yield chosen
-        first = end
+            chosen, error, end = longer, longer_error, end + 1
+        if heights[end] - heights[first] < _STEP:  # a step: the next frustum begins, or the last one ends, beyond it
+            if end == last and found:
+                found[-1][:, 2][found[-1][:, 2] == found[-1][:, 2].max()] = heights[end]
+            first = end
+            continue
+        pieces = [chosen] if error < _TOLERANCE + 2e-5 else _quarters(polygons[[first, end]], heights[[first, end]])
+        for piece in pieces:
+            piece[piece[:, 2] == heights[first], 2] = begin
+        found += pieces
+        first, begin = end, heights[end]
+    yield from found
 
 
-def _frustum(heights, polygons, sags, upright, first: int, last: int) -> tuple[np.ndarray, float]:
+class _Slab(NamedTuple):
+    """Rings of a solid body, the sagittas of their chords, and the room to move their corners outwards and inwards."""
+
+    heights: np.ndarray
+    polygons: np.ndarray
+    sagittas: list[np.ndarray]
+    outwards: np.ndarray
+    inwards: np.ndarray
+
+
+def _frustum(slab: _Slab, first: int, last: int) -> tuple[np.ndarray, float]:
     """Corners of the frustum between two rings, and the largest distance of the rings in between from its hull."""
-    count = polygons.shape[1]
-    chosen = np.arange(count)
-    if 2 * count > _CORNERS:
-        chosen = _fewest_corners(np.maximum(sags[first], sags[last]), _CORNERS // 2)
+    heights, polygons = slab.heights, slab.polygons
+    chosen = np.arange(polygons.shape[1])
+    if 2 * len(chosen) > _CORNERS:
+        chosen = _fewest_corners(np.maximum(slab.sagittas[first], slab.sagittas[last]), _CORNERS // 2)
     corners = np.concatenate(
         [np.column_stack([polygons[ring, chosen], np.full(len(chosen), heights[ring])]) for ring in (first, last)]
     )
-    flat = polygons[first : last + 1]
-    true = np.concatenate([flat, np.broadcast_to(heights[first : last + 1, None, None], (*flat.shape[:2], 1))], axis=2)
-    # Points in the middle between corners, and between rings, see errors of rings of two different shapes.
+    true = _at_heights(polygons[first : last + 1], heights[first : last + 1])
+    # Points in the middle between rings see the errors of rings of two different shapes.
     true = np.concatenate([true, (true[:-1] + true[1:]) / 2]).reshape(-1, 3)
-    steep = np.repeat(upright[[first, last]], len(chosen))
+    lengths = np.maximum(np.linalg.norm(corners[:, :2], axis=1), 1e-9)
     best, error, shift = corners, np.inf, 0.0
     for _ in range(2):  # the second time, the error is the same on both sides of the surface
         moved = corners.copy()
-        lengths = np.linalg.norm(moved[:, :2], axis=1)
-        moved[:, :2] *= (1 + shift / steep / np.maximum(lengths, 1e-9))[:, None]
+        room = (slab.outwards if shift > 0 else slab.inwards)[[first, last]] / _TOLERANCE
+        moved[:, :2] *= (1 + shift * np.repeat(room, len(chosen)) / lengths)[:, None]
         planes = _planes(moved)
         side = planes[np.abs(planes[:, 2]) < 1 - 1e-9]
         depth = np.max(true @ side[:, :3].T + side[:, 3], axis=1)
         worst = float(np.max(np.abs(depth)))
         if worst < error:
             best, error = moved, worst
-        shift = (depth.max() + depth.min()) / 2
+        shift = np.clip((depth.max() + depth.min()) / 2, -_TOLERANCE, _TOLERANCE)
     return best, error
 
 
-def _upright(heights: np.ndarray, radii: np.ndarray) -> np.ndarray:
-    """How upright the steeper side next to every ring is, 0 to 1, by its radii (rings, ...)."""
-    rise, widen = np.diff(heights), np.diff(radii.reshape(len(radii), -1), axis=0)
-    steep = rise / np.hypot(rise, np.abs(widen).min(axis=1))
-    padded = np.concatenate([[0.0], steep, [0.0]])
-    return np.maximum(np.maximum(padded[:-1], padded[1:]), 0.02)
+def _quarters(polygons: np.ndarray, heights: np.ndarray) -> list[np.ndarray]:
+    """Sectors of a frustum that is too wide for its few corners; they have all corners."""
+    cuts = np.linspace(0, polygons.shape[1], 5).astype(int)
+    closed = np.concatenate([polygons, polygons[:, :1]], axis=1)
+    axis = np.zeros((2, 1, 2))
+    return [
+        _at_heights(np.concatenate([axis, closed[:, start : end + 1]], axis=1), heights).reshape(-1, 3)
+        for start, end in zip(cuts[:-1], cuts[1:])
+    ]
+
+
+def _at_heights(flat: np.ndarray, heights: np.ndarray) -> np.ndarray:
+    """Points (levels, points, 3) of flat ones (levels, points, 2) at their heights (levels,)."""
+    return np.concatenate([flat, np.broadcast_to(heights[:, None, None], (*flat.shape[:2], 1))], axis=2)
+
+
+def _room(heights: np.ndarray, radii: np.ndarray, sign: float) -> np.ndarray:
+    """How far every ring can widen, or narrow for a sign of -1, before it is farther than the tolerance from the profile."""
+    steps = np.linspace(0, 10 * _TOLERANCE, 51)
+    line = np.stack([radii, heights], axis=1)
+    points = np.stack([radii[:, None] + sign * steps, np.broadcast_to(heights[:, None], (len(radii), 51))], axis=2)
+    along = np.diff(line, axis=0)
+    away = points[:, :, None] - line[:-1]
+    share = np.clip(np.sum(away * along, axis=3) / np.sum(along**2, axis=1), 0, 1)
+    distance = np.linalg.norm(away - share[..., None] * along, axis=3).min(axis=2)
+    within = np.logical_and.accumulate(distance <= 1.0001 * _TOLERANCE, axis=1)
+    return steps[within.sum(axis=1) - 1]
 
 
 def _sagittas(polygon: np.ndarray) -> np.ndarray:
@@ -260,7 +298,7 @@ def _shell(outer: _Stack, inner: _Stack, levels: np.ndarray) -> Iterator[np.ndar
     unit, at = _fine_outline(holes[0] / sizes[0])
     table = _sector_table(np.round(unit, 12).tobytes(), len(unit))
 
-    profile = _Profile(levels, sizes, walls, _upright(levels, sizes), _upright(levels, walls))
+    profile = _Profile(levels, sizes, walls, _room(levels, sizes, 1.0), _room(levels, walls, -1.0))
 
     # The fewest sectors in all, by dynamic programming over the levels to cut at.
     count = len(levels)
@@ -287,13 +325,13 @@ def _shell(outer: _Stack, inner: _Stack, levels: np.ndarray) -> Iterator[np.ndar
 
 
 class _Profile(NamedTuple):
-    """Largest radii of a hollow and of the outside at rising levels, and how upright the steeper side there is."""
+    """Largest radii of a hollow and of the outside at rising levels, and the room of their rings into the material."""
 
     levels: np.ndarray
     inner: np.ndarray
     outer: np.ndarray
-    inner_upright: np.ndarray
-    outer_upright: np.ndarray
+    inner_room: np.ndarray
+    outer_room: np.ndarray
 
 
 class _Plan(NamedTuple):
@@ -311,22 +349,32 @@ def _plan(profile: _Profile, table) -> _Plan | None:
     levels = profile.levels
     inner, steep, gap = _envelope(levels, profile.inner)
     outer, outer_steep, outer_gap = _envelope(levels, -profile.outer)
-    # A shift of 1 of the surface at the rings moves its flat faces by this at the levels in between.
-    moves = steep * np.interp(levels, levels[inner], 1 / profile.inner_upright[inner])
-    outer_moves = outer_steep * np.interp(levels, levels[outer], 1 / profile.outer_upright[outer])
-    outer_shift = np.max(outer_gap / (1 + outer_moves))
-    if outer_shift > _TOLERANCE - _OUTER:
+    outer_moves = outer_steep * np.interp(levels, levels[outer], profile.outer_room[outer])
+    outer_shift, outer_error = _balanced(outer_gap, outer_gap, outer_moves)
+    if outer_error > _TOLERANCE - _OUTER:
         return None
+    moves = steep * np.interp(levels, levels[inner], profile.inner_room[inner])
+    most = min(1.0, np.min((_TOLERANCE + gap) / moves))
     wide = profile.inner * steep
-    allowed = np.min((_TOLERANCE * (1 + moves) - gap) / wide)
+    allowed = np.min((_TOLERANCE + most * moves - gap) / wide)
     fitting = [row for row in table if row[0] <= allowed]
     if not fitting:
         return None
     budget, cuts = fitting[-1]
-    shift = np.max((gap + budget * wide) / (1 + moves))
-    return _Plan(
-        cuts, inner, shift / profile.inner_upright[inner], outer, outer_shift / profile.outer_upright[outer]
-    )
+    shift, _ = _balanced(gap, gap + budget * wide, moves)
+    return _Plan(cuts, inner, shift * profile.inner_room[inner], outer, outer_shift * profile.outer_room[outer])
+
+
+def _balanced(least: np.ndarray, most: np.ndarray, moves: np.ndarray) -> tuple[float, float]:
+    """Share of the moves (levels,) into the material that makes the errors the same on both sides, and that error.
+
+    Without the move, faces fill between `least` and `most` outside the material.
+    """
+    shares = np.linspace(0, 1, 21)[:, None]
+    into = np.maximum(np.max(shares * moves - least, axis=1), shares[:, 0] * _TOLERANCE)
+    error = np.maximum(into, np.max(most - shares * moves, axis=1))
+    best = int(np.argmin(error))
+    return float(shares[best, 0]), float(error[best])
 
 
 def _envelope(levels: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -369,14 +417,8 @@ def _sectors(plan: _Plan, levels, holes, bodies, at) -> Iterator[np.ndarray]:
         length = np.linalg.norm(edge, axis=2, keepdims=True)
         edge = edge * (1 - plan.outer_shift[:, None, None] / length)
         rings_kept = _simplified(np.column_stack([levels[plan.outer], length[:, 0, 0]]), _OUTER)
-        yield np.concatenate(
-            [
-                np.concatenate([flat, np.broadcast_to(height[:, None, None], (*flat.shape[:2], 1))], axis=2).reshape(
-                    -1, 3
-                )
-                for flat, height in ((near, levels[plan.inner]), (edge[rings_kept], levels[plan.outer][rings_kept]))
-            ]
-        )
+        near, edge = _at_heights(near, levels[plan.inner]), _at_heights(edge[rings_kept], levels[plan.outer][rings_kept])
+        yield np.concatenate([near.reshape(-1, 3), edge.reshape(-1, 3)])
 
 
 def _simplified(line: np.ndarray, tolerance: float) -> np.ndarray:
@@ -477,7 +519,7 @@ def _near_surface(stack: _Stack, low: np.ndarray, high: np.ndarray) -> tuple[np.
     heights = np.union1d(np.linspace(begin, end, max(int((end - begin) / 4e-4), 2)), [begin, end])
     fine = np.arange(4 * stack.rings.shape[1]) / 4
     flat = _on_ring(stack.at(heights), fine)
-    points = np.concatenate([flat, np.broadcast_to(heights[:, None, None], (*flat.shape[:2], 1))], axis=2)
+    points = _at_heights(flat, heights)
     around = np.roll(points, -1, axis=1) - np.roll(points, 1, axis=1)
     normals = np.cross(around, np.gradient(points, axis=0))
     normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-12)
