@@ -17,12 +17,12 @@ from tdf_jax.shapes.shape import Shape
 from tdf_jax.shapes.solid import Bar, Part, Tube, rings, tube_rings
 
 _TOLERANCE = 4e-4  # intended distance of the parts' surface from the true one, metres, on either side
-_FINE = 2e-5  # distance by which profiles and outlines are simplified, metres
+_FINE = 3e-5  # distance by which profiles and outlines are simplified, metres
 _OUTER = 8e-5  # the same for the outside of a wall, whose every corner costs time in contact
 _CORNERS = 64  # most corners of a part
 _STEP = 1.5e-4  # rings closer than this, metres, are the step of a cap; a part between them would be a needle
 _THINNEST = 3e-4  # thinnest part worth having, metres
-_BUDGETS = np.geomspace(1e-4, 0.3, 48)  # sagittas of a sector to tabulate, shares of the largest radius
+_BUDGETS = np.geomspace(1e-3, 0.3, 36)  # sagittas of a sector to tabulate, shares of the largest radius
 
 
 class _Stack(NamedTuple):
@@ -115,7 +115,7 @@ def _body(outer: _Stack, hollows: list[_Stack], low: float, high: float) -> Iter
 
 def _slabs(stack: _Stack) -> Iterator[np.ndarray]:
     """Frusta of a solid body, each as tall as the tolerance allows."""
-    sizes = np.linalg.norm(stack.rings, axis=2).max(axis=1)
+    sizes = _extremes(stack.rings)
     keep = _simplified(np.column_stack([stack.heights, sizes]), _FINE)
     keep = np.union1d(keep, np.linspace(0, len(sizes) - 1, 12).astype(int))  # outlines differ at equal sizes
     heights, polygons, sizes = stack.heights[keep], stack.rings[keep], sizes[keep]
@@ -200,11 +200,26 @@ def _at_heights(flat: np.ndarray, heights: np.ndarray) -> np.ndarray:
     return np.concatenate([flat, np.broadcast_to(heights[:, None, None], (*flat.shape[:2], 1))], axis=2)
 
 
-def _room(heights: np.ndarray, radii: np.ndarray, sign: float) -> np.ndarray:
-    """How far every ring can widen, or narrow for a sign of -1, before it is farther than the tolerance from the profile."""
-    steps = np.linspace(0, 10 * _TOLERANCE, 51)
+def _extremes(polygons: np.ndarray) -> np.ndarray:
+    """Largest and smallest radii (levels, 2) of polygons (levels, corners, 2)."""
+    radii = np.linalg.norm(polygons, axis=2)
+    return np.stack([radii.max(axis=1), radii.min(axis=1)], axis=1)
+
+
+def _room(heights: np.ndarray, profiles: np.ndarray, sign: float, closed: tuple[bool, bool] = (False, False)):
+    """How far every ring can widen, or narrow for a sign of -1, before it is too far from the profiles (levels, 2).
+
+    A profile may be closed by a flat floor and ceiling.
+    """
+    return np.minimum(*(_profile_room(heights, radii, sign, closed) for radii in profiles.T))
+
+
+def _profile_room(heights, radii, sign, closed) -> np.ndarray:
+    steps = np.linspace(0, 10 * _TOLERANCE, 81)
     line = np.stack([radii, heights], axis=1)
-    points = np.stack([radii[:, None] + sign * steps, np.broadcast_to(heights[:, None], (len(radii), 51))], axis=2)
+    points = line[:, None] + np.stack([sign * steps, np.zeros_like(steps)], axis=1)
+    floor, ceiling = ([line[end] * [0, 1]] if flat else [] for end, flat in zip((0, -1), closed))
+    line = np.array([*floor, *line, *ceiling])
     along = np.diff(line, axis=0)
     away = points[:, :, None] - line[:-1]
     share = np.clip(np.sum(away * along, axis=3) / np.sum(along**2, axis=1), 0, 1)
@@ -233,7 +248,7 @@ def _cuts(sags: np.ndarray, budget: float) -> np.ndarray:
     count = len(sags)
     reach = np.maximum(np.sum(sags <= budget, axis=1), 1).tolist()
     best = None
-    for start in range(0, max(count // 8, 1), max(count // 64, 1)):
+    for start in range(0, max(count // 8, 1), max(count // 32, 1)):
         at, found = start, []
         while at < start + count:
             found.append(at)
@@ -245,10 +260,16 @@ def _cuts(sags: np.ndarray, budget: float) -> np.ndarray:
 
 
 def _fewest_corners(sags: np.ndarray, most: int) -> np.ndarray:
-    for budget in np.geomspace(1e-5, 0.02, 40):
-        found = _cuts(sags, budget)
-        if len(found) <= most:
-            break
+    """At most this many corners of a closed polygon, with the smallest sagittas."""
+    low, high = -17.0, -4.0  # powers of two of the budget, metres
+    found = _cuts(sags, 2.0**high)
+    while high - low > 0.2:
+        middle = (low + high) / 2
+        cuts = _cuts(sags, 2.0**middle)
+        if len(cuts) <= most:
+            found, high = cuts, middle
+        else:
+            low = middle
     return found
 
 
@@ -295,10 +316,15 @@ def _shell(outer: _Stack, inner: _Stack, levels: np.ndarray) -> Iterator[np.ndar
     walls = np.linalg.norm(bodies[:, widest], axis=1)
     keep = _simplified(np.column_stack([levels, sizes, walls]), _FINE)
     levels, holes, bodies, sizes, walls = levels[keep], holes[keep], bodies[keep], sizes[keep], walls[keep]
+    floor = (within[0] >= levels[0] - 1e-9, within[-1] <= levels[-1] + 1e-9)
+    rooms = (_room(levels, _extremes(holes), sign, floor) for sign in (1.0, -1.0))
+    outer_rooms = (_room(levels, _extremes(bodies), sign) for sign in (-1.0, 1.0))
     unit, at = _fine_outline(holes[0] / sizes[0])
     table = _sector_table(np.round(unit, 12).tobytes(), len(unit))
 
-    profile = _Profile(levels, sizes, walls, _room(levels, sizes, 1.0), _room(levels, walls, -1.0))
+    profile = _Profile(levels, sizes, walls, *rooms, *outer_rooms)
+
+    slant = _slant(holes[-1], bodies[-1])
 
     # The fewest sectors in all, by dynamic programming over the levels to cut at.
     count = len(levels)
@@ -306,11 +332,11 @@ def _shell(outer: _Stack, inner: _Stack, levels: np.ndarray) -> Iterator[np.ndar
     cost[0] = 0
     for last in range(1, count):
         for first in range(last - 1, -1, -1):
-            plan = _plan(_Profile(*(values[first : last + 1] for values in profile)), table)
+            plan = _plan(_Profile(*(values[first : last + 1] for values in profile)), table, slant)
             if plan is None:
                 if last - first == 1:
                     raise InputError("convex_parts(): the object is too large for its tolerance; scale it down")
-                if levels[last] - levels[first] > 0.003:
+                if levels[last] - levels[first] > 0.001:
                     break
                 continue
             total = cost[first] + len(plan.cuts)
@@ -324,14 +350,26 @@ def _shell(outer: _Stack, inner: _Stack, levels: np.ndarray) -> Iterator[np.ndar
         last = first
 
 
+def _slant(hole: np.ndarray, body: np.ndarray) -> float:
+    """How far an edge of a hollow moves at least, if its corners move by 1 towards those of the outside."""
+    edge = np.roll(hole, -1, axis=0) - hole
+    normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
+    across = (body - hole) / np.maximum(np.linalg.norm(body - hole, axis=1, keepdims=True), 1e-12)
+    return float(
+        np.clip(np.minimum(np.sum(normal * across, 1), np.sum(normal * np.roll(across, -1, 0), 1)).min(), 0, 1)
+    )
+
+
 class _Profile(NamedTuple):
-    """Largest radii of a hollow and of the outside at rising levels, and the room of their rings into the material."""
+    """Largest radii of a hollow and of the outside at rising levels, and their room into the material and the air."""
 
     levels: np.ndarray
     inner: np.ndarray
     outer: np.ndarray
     inner_room: np.ndarray
+    inner_air: np.ndarray
     outer_room: np.ndarray
+    outer_air: np.ndarray
 
 
 class _Plan(NamedTuple):
@@ -344,41 +382,48 @@ class _Plan(NamedTuple):
     outer_shift: np.ndarray
 
 
-def _plan(profile: _Profile, table) -> _Plan | None:
+def _plan(profile: _Profile, table, slant: float) -> _Plan | None:
     """Cuts of a wall between the first and the last level, or None if its profile is bent too much."""
     levels = profile.levels
-    inner, steep, gap = _envelope(levels, profile.inner)
-    outer, outer_steep, outer_gap = _envelope(levels, -profile.outer)
-    outer_moves = outer_steep * np.interp(levels, levels[outer], profile.outer_room[outer])
-    outer_shift, outer_error = _balanced(outer_gap, outer_gap, outer_moves)
-    if outer_error > _TOLERANCE - _OUTER:
+    outer, gap = _envelope(levels, -profile.outer)
+    moves = np.interp(levels, levels[outer], profile.outer_room[outer])
+    outer_shift, error = _balanced(
+        moves / profile.outer_room, gap / profile.outer_room, gap / profile.outer_air, moves / profile.outer_air
+    )
+    if error > 1 - _OUTER / _TOLERANCE:
         return None
-    moves = steep * np.interp(levels, levels[inner], profile.inner_room[inner])
-    most = min(1.0, np.min((_TOLERANCE + gap) / moves))
-    wide = profile.inner * steep
-    allowed = np.min((_TOLERANCE + most * moves - gap) / wide)
+    inner, gap = _envelope(levels, profile.inner)
+    moves = np.interp(levels, levels[inner], profile.inner_room[inner])
+    most = min(1.0, np.min((profile.inner_room + gap) / moves))
+    allowed = np.min((profile.inner_air + most * moves * slant - gap) / profile.inner)
     fitting = [row for row in table if row[0] <= allowed]
     if not fitting:
         return None
     budget, cuts = fitting[-1]
-    shift, _ = _balanced(gap, gap + budget * wide, moves)
+    shift, _ = _balanced(
+        moves / profile.inner_room,
+        gap / profile.inner_room,
+        (gap + budget * profile.inner) / profile.inner_air,
+        moves * slant / profile.inner_air,
+    )
     return _Plan(cuts, inner, shift * profile.inner_room[inner], outer, outer_shift * profile.outer_room[outer])
 
 
-def _balanced(least: np.ndarray, most: np.ndarray, moves: np.ndarray) -> tuple[float, float]:
-    """Share of the moves (levels,) into the material that makes the errors the same on both sides, and that error.
+def _balanced(into: np.ndarray, least: np.ndarray, most: np.ndarray, out: np.ndarray) -> tuple[float, float]:
+    """Share of the moves into the material that makes the errors the same on both sides, and that error.
 
-    Without the move, faces fill between `least` and `most` outside the material.
+    Without a move, faces fill between `least` and `most` outside the material; the full move shifts them by `into` and
+    `out`. All are shares of the room on that side, (levels,).
     """
     shares = np.linspace(0, 1, 21)[:, None]
-    into = np.maximum(np.max(shares * moves - least, axis=1), shares[:, 0] * _TOLERANCE)
-    error = np.maximum(into, np.max(most - shares * moves, axis=1))
+    error = np.maximum(np.max(shares * into - least, axis=1), shares[:, 0])
+    error = np.maximum(error, np.max(most - shares * out, axis=1))
     best = int(np.argmin(error))
     return float(shares[best, 0]), float(error[best])
 
 
-def _envelope(levels: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lower convex envelope of a profile: its rings; at every level, how upright it is, 0 to 1, and the gap to it."""
+def _envelope(levels: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lower convex envelope of a profile: its rings, and the gap to it at every level."""
     hull = [0]
     x, y = levels.tolist(), radii.tolist()
     for k in range(1, len(x)):
@@ -390,13 +435,7 @@ def _envelope(levels: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.nda
                 break
         hull.append(k)
     kept = np.array(hull)
-    steep = np.diff(levels[kept]) / np.hypot(np.diff(levels[kept]), np.diff(radii[kept]))
-    # At a ring, the steeper side counts.
-    steep = np.maximum(
-        steep[np.clip(np.searchsorted(kept, np.arange(len(levels)), side="right") - 1, 0, len(steep) - 1)],
-        steep[np.clip(np.searchsorted(kept, np.arange(len(levels))) - 1, 0, len(steep) - 1)],
-    )
-    return kept, steep, (radii - np.interp(levels, levels[kept], radii[kept])) * steep
+    return kept, radii - np.interp(levels, levels[kept], radii[kept])
 
 
 def _sectors(plan: _Plan, levels, holes, bodies, at) -> Iterator[np.ndarray]:
@@ -417,7 +456,10 @@ def _sectors(plan: _Plan, levels, holes, bodies, at) -> Iterator[np.ndarray]:
         length = np.linalg.norm(edge, axis=2, keepdims=True)
         edge = edge * (1 - plan.outer_shift[:, None, None] / length)
         rings_kept = _simplified(np.column_stack([levels[plan.outer], length[:, 0, 0]]), _OUTER)
-        near, edge = _at_heights(near, levels[plan.inner]), _at_heights(edge[rings_kept], levels[plan.outer][rings_kept])
+        near, edge = (
+            _at_heights(near, levels[plan.inner]),
+            _at_heights(edge[rings_kept], levels[plan.outer][rings_kept]),
+        )
         yield np.concatenate([near.reshape(-1, 3), edge.reshape(-1, 3)])
 
 
