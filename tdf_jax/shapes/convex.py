@@ -22,6 +22,7 @@ _OUTER = 8e-5  # the same for the outside of a wall, whose every corner costs ti
 _CORNERS = 64  # most corners of a part
 _STEP = 1.5e-4  # rings closer than this, metres, are the step of a cap; a part between them would be a needle
 _THINNEST = 3e-4  # thinnest part worth having, metres
+_BETWEEN = 3  # steps between two levels at which errors of a wall are tested
 _BUDGETS = np.geomspace(1e-3, 0.3, 36)  # sagittas of a sector to tabulate, shares of the largest radius
 
 
@@ -316,14 +317,15 @@ def _shell(outer: _Stack, inner: _Stack, levels: np.ndarray) -> Iterator[np.ndar
     walls = np.linalg.norm(bodies[:, widest], axis=1)
     keep = _simplified(np.column_stack([levels, sizes, walls]), _FINE)
     levels, holes, bodies, sizes, walls = levels[keep], holes[keep], bodies[keep], sizes[keep], walls[keep]
+    dense = np.interp(np.arange(_BETWEEN * (len(levels) - 1) + 1) / _BETWEEN, np.arange(len(levels)), levels)
+    at_dense = inner.at(dense - drop), outer.at(dense)
     floor = (within[0] >= levels[0] - 1e-9, within[-1] <= levels[-1] + 1e-9)
-    rooms = (_room(levels, _extremes(holes), sign, floor) for sign in (1.0, -1.0))
-    outer_rooms = (_room(levels, _extremes(bodies), sign) for sign in (-1.0, 1.0))
+    rooms = (_room(dense, _extremes(at_dense[0]), sign, floor) for sign in (1.0, -1.0))
+    outer_rooms = (_room(dense, _extremes(at_dense[1]), sign) for sign in (-1.0, 1.0))
+    dense_sizes, dense_walls = (np.interp(dense, levels, radii) for radii in (sizes, walls))
+    profile = _Profile(dense, dense_sizes, dense_walls, *rooms, *outer_rooms)
     unit, at = _fine_outline(holes[0] / sizes[0])
     table = _sector_table(np.round(unit, 12).tobytes(), len(unit))
-
-    profile = _Profile(levels, sizes, walls, *rooms, *outer_rooms)
-
     slant = _slant(holes[-1], bodies[-1])
 
     # The fewest sectors in all, by dynamic programming over the levels to cut at.
@@ -332,7 +334,9 @@ def _shell(outer: _Stack, inner: _Stack, levels: np.ndarray) -> Iterator[np.ndar
     cost[0] = 0
     for last in range(1, count):
         for first in range(last - 1, -1, -1):
-            plan = _plan(_Profile(*(values[first : last + 1] for values in profile)), table, slant)
+            plan = _plan(
+                _Profile(*(values[_BETWEEN * first : _BETWEEN * last + 1] for values in profile)), table, slant
+            )
             if plan is None:
                 if last - first == 1:
                     raise InputError("convex_parts(): the object is too large for its tolerance; scale it down")
@@ -385,15 +389,18 @@ class _Plan(NamedTuple):
 def _plan(profile: _Profile, table, slant: float) -> _Plan | None:
     """Cuts of a wall between the first and the last level, or None if its profile is bent too much."""
     levels = profile.levels
-    outer, gap = _envelope(levels, -profile.outer)
-    moves = np.interp(levels, levels[outer], profile.outer_room[outer])
+    rings = levels[::_BETWEEN]
+    outer, gap = _envelope(rings, -profile.outer[::_BETWEEN], levels)
+    outer_room = profile.outer_room[::_BETWEEN][outer]
+    moves = np.interp(levels, rings[outer], outer_room)
     outer_shift, error = _balanced(
         moves / profile.outer_room, gap / profile.outer_room, gap / profile.outer_air, moves / profile.outer_air
     )
     if error > 1 - _OUTER / _TOLERANCE:
         return None
-    inner, gap = _envelope(levels, profile.inner)
-    moves = np.interp(levels, levels[inner], profile.inner_room[inner])
+    inner, gap = _envelope(rings, profile.inner[::_BETWEEN], levels)
+    inner_room = profile.inner_room[::_BETWEEN][inner]
+    moves = np.interp(levels, rings[inner], inner_room)
     most = min(1.0, np.min((profile.inner_room + gap) / moves))
     allowed = np.min((profile.inner_air + most * moves * slant - gap) / profile.inner)
     fitting = [row for row in table if row[0] <= allowed]
@@ -406,7 +413,7 @@ def _plan(profile: _Profile, table, slant: float) -> _Plan | None:
         (gap + budget * profile.inner) / profile.inner_air,
         moves * slant / profile.inner_air,
     )
-    return _Plan(cuts, inner, shift * profile.inner_room[inner], outer, outer_shift * profile.outer_room[outer])
+    return _Plan(cuts, inner, shift * inner_room, outer, outer_shift * outer_room)
 
 
 def _balanced(into: np.ndarray, least: np.ndarray, most: np.ndarray, out: np.ndarray) -> tuple[float, float]:
@@ -422,10 +429,10 @@ def _balanced(into: np.ndarray, least: np.ndarray, most: np.ndarray, out: np.nda
     return float(shares[best, 0]), float(error[best])
 
 
-def _envelope(levels: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower convex envelope of a profile: its rings, and the gap to it at every level."""
+def _envelope(rings: np.ndarray, radii: np.ndarray, levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lower convex envelope of a profile at its rings: those on it, and the gap to it at levels."""
     hull = [0]
-    x, y = levels.tolist(), radii.tolist()
+    x, y = rings.tolist(), radii.tolist()
     for k in range(1, len(x)):
         while len(hull) > 1:
             a, b = hull[-2], hull[-1]
@@ -435,7 +442,7 @@ def _envelope(levels: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.nda
                 break
         hull.append(k)
     kept = np.array(hull)
-    return kept, radii - np.interp(levels, levels[kept], radii[kept])
+    return kept, np.interp(levels, rings, radii) - np.interp(levels, rings[kept], radii[kept])
 
 
 def _sectors(plan: _Plan, levels, holes, bodies, at) -> Iterator[np.ndarray]:
@@ -455,7 +462,7 @@ def _sectors(plan: _Plan, levels, holes, bodies, at) -> Iterator[np.ndarray]:
         edge = _on_ring(outer, along)
         length = np.linalg.norm(edge, axis=2, keepdims=True)
         edge = edge * (1 - plan.outer_shift[:, None, None] / length)
-        rings_kept = _simplified(np.column_stack([levels[plan.outer], length[:, 0, 0]]), _OUTER)
+        rings_kept = _simplified(np.column_stack([levels[plan.outer], edge[:, 0]]), _OUTER)
         near, edge = (
             _at_heights(near, levels[plan.inner]),
             _at_heights(edge[rings_kept], levels[plan.outer][rings_kept]),
