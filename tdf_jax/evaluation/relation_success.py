@@ -140,8 +140,7 @@ def _hangs(mug: Mug, rack: Rack, T_rack_mug, contact, centre) -> tuple[bool, boo
     swing[:3, :3] = _turned_down(arm / max(np.linalg.norm(arm), 1e-9))
     swing[:3, 3] = contact - swing[:3, :3] @ contact
     hung = [
-        _crosses(mug, moved(line, np.linalg.inv(T_rack_mug)))
-        and _crosses(mug, moved(line, np.linalg.inv(swing @ T_rack_mug)))
+        hole_is_crossed(mug, line, T_rack_mug) and hole_is_crossed(mug, line, swing @ T_rack_mug)
         for line in rack.peg_lines
     ]
     if not any(hung):
@@ -158,6 +157,19 @@ def _turned_down(direction: np.ndarray) -> np.ndarray:
     angle = np.arctan2(sine, -direction[2])
     axis = axis / sine if sine > 1e-9 else np.array([1.0, 0.0, 0.0])
     return np.asarray(se3.exp(angle * axis), float)
+
+
+def hole_is_crossed(
+    mug: Mug, line: Float[np.ndarray, "2 3"], T_target_mug: Float[np.ndarray, "4 4"]
+) -> bool:
+    """Whether a line from one point to another, such as a peg's axis, goes through a mug's finger hole.
+
+    Args:
+        mug: the mug.
+        line: the two points, (2, 3), metres, in the target's frame.
+        T_target_mug: pose of the mug in that frame, 4x4.
+    """
+    return _crosses(mug, moved(line, np.linalg.inv(T_target_mug)))
 
 
 def _crosses(mug: Mug, line: Float[np.ndarray, "2 3"]) -> bool:

@@ -1,0 +1,97 @@
+"""What touches what in a cell, for a motion that is planned: the arm, the hand, the held object and the surroundings."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from tdf_jax.sim.physics import extra
+from tdf_jax.sim.robot import PREFIX
+from tdf_jax.sim.workcell import OBJECT, TABLE_NAME, TARGET, Workcell
+
+ARM, HAND_KIND, OBJECT_KIND, TARGET_KIND, TABLE_KIND, OTHER = range(6)
+NAMES = ("arm", "hand", "object", "target", "table", "surroundings")
+DEPTH = 0.0005  # metres of penetration that count as contact
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Collisions:
+    """Finds collisions of planned positions in a cell, in a state of its own.
+
+    Attributes:
+        cell: the cell, with the arm.
+    """
+
+    cell: Workcell
+
+    @functools.cached_property
+    def _data(self) -> Any:
+        return self.cell.data()
+
+    @functools.cached_property
+    def _kinds(self) -> np.ndarray:
+        return geom_kinds(self.cell)
+
+    def depths(
+        self,
+        joints: Float[np.ndarray, " joints"],
+        opening: float,
+        T_world_object: Float[np.ndarray, "4 4"] | None = None,
+        T_world_target: Float[np.ndarray, "4 4"] | None = None,
+    ) -> dict[tuple[str, str], float]:
+        """Penetrations of the pairs that touch, metres, by the names of the two, in the order of `NAMES`.
+
+        Args:
+            joints: positions of the arm's joints, (joints,), radians.
+            opening: opening of the fingers, metres.
+            T_world_object: pose of the object, 4x4; where it starts by default.
+            T_world_target: pose of the target, 4x4, if it is free; where it starts by default.
+        """
+        mujoco = extra("plan_joints()", "mujoco")
+        cell, data = self.cell, self._data
+        data.qpos[cell.arm] = joints
+        cell.open_fingers(data, opening)
+        if T_world_object is not None:
+            cell.set_body_pose(data, OBJECT, T_world_object)
+        if T_world_target is not None and not cell.fixed_target:
+            cell.set_body_pose(data, TARGET, T_world_target)
+        mujoco.mj_kinematics(cell.model, data)
+        mujoco.mj_collision(cell.model, data)
+        found: dict[tuple[str, str], float] = {}
+        if data.ncon:
+            pairs = np.sort(self._kinds[data.contact.geom], axis=1)
+            for (a, b), distance in zip(pairs, data.contact.dist):
+                if -distance > DEPTH:
+                    key = NAMES[a], NAMES[b]
+                    found[key] = max(found.get(key, 0.0), -float(distance))
+        return found
+
+
+def geom_kinds(cell: Workcell) -> np.ndarray:
+    """The kind of every geom of a cell, an index in `NAMES`: (geoms,)."""
+    model, robot = cell.model, cell.robot
+    last = -1
+    if robot is not None and not cell.floating:
+        last = int(model.jnt_bodyid[model.joint(PREFIX + robot.joints[-1]).id])
+    kinds = np.full(model.ngeom, OTHER)
+    for number in range(model.ngeom):
+        body = int(model.geom_bodyid[number])
+        name = model.body(body).name
+        if name.startswith(PREFIX):
+            kinds[number] = HAND_KIND if cell.floating or _carried(model, body, last) else ARM
+        elif name in (OBJECT, TARGET):
+            kinds[number] = OBJECT_KIND if name == OBJECT else TARGET_KIND
+        elif model.geom(number).name == TABLE_NAME:
+            kinds[number] = TABLE_KIND
+    return kinds
+
+
+def _carried(model, body: int, by: int) -> bool:
+    """Whether a body is another one or hangs on it."""
+    while body:
+        if body == by:
+            return True
+        body = int(model.body_parentid[body])
+    return False

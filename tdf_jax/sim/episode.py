@@ -1,0 +1,310 @@
+"""Episodes: one task from the start to the settled end, executed by the arm or with the object reset to its goal."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, cast
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from tdf_jax.evaluation.relation_success import UPRIGHT, hole_is_crossed
+from tdf_jax.shapes import Mug, Rack
+from tdf_jax.sim.bodies import Body, body_of
+from tdf_jax.sim.collision import ARM, HAND_KIND, OBJECT_KIND, TABLE_KIND, TARGET_KIND, geom_kinds
+from tdf_jax.sim.execution import execute
+from tdf_jax.sim.grasping import MOST_SLIP, MOST_TURN, test_grasp
+from tdf_jax.sim.motion import Failure, plan_motion
+from tdf_jax.sim.physics import TIMESTEP, extra
+from tdf_jax.sim.robot import Robot
+from tdf_jax.sim.tasks import TASKS, Episode
+from tdf_jax.sim.workcell import FIXTURE, OBJECT, TARGET, Workcell, build_workcell
+
+MODES = ("execute", "teleport")
+SETTLE = 2.0  # seconds after the release, as in NDF and R-NDF
+MOVING = 0.25  # m/s, faster than a mug that swings on its peg, which nothing damps but friction
+UPSIDE_DOWN = 1.0  # seconds with gravity reversed
+FALLS = 0.03  # metres that an object moves from its target then, unless it is stuck in it
+WATCHED = 5  # steps of the physics between looks
+# Errors of a pick, metres and degrees, from which it is the pick that failed.
+WRONG_PICK = (0.03, 30.0)
+CAUSES = (
+    "pick wrong",
+    "unreachable",
+    "slipped",
+    "lost in transit",
+    "hit the target on approach",
+    "collided",
+    "fell",
+    "stuck",
+    "not upright",
+    "not on the peg",
+    "not settled",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What became of an episode.
+
+    Attributes:
+        grasp: whether the object was held: in the grasp test, or from the pick to the release.
+        place: whether it ended placed on the target, whatever became of the grasp test.
+        overall: both.
+        strict: as `overall`, and a mug hangs with the peg through its finger hole, which R-NDF does not ask for.
+        cause: the first thing that went wrong, of `CAUSES`; empty for a success.
+        detail: more about it, in words.
+        slip, turn: movement of the object in the hand after closing, metres and degrees; NaN without a grasp.
+    """
+
+    grasp: bool
+    place: bool
+    overall: bool
+    strict: bool
+    cause: str
+    detail: str
+    slip: float
+    turn: float
+
+
+def teleport(
+    episode: Episode,
+    robot: Robot,
+    pick: Float[np.ndarray, "4 4"],
+    motion: Float[np.ndarray, "4 4"],
+    bodies: "Bodies | None" = None,
+) -> Outcome:
+    """The protocol of NDF and R-NDF: grasp and place are tested apart, and the object is reset to where it is placed.
+
+    Grasp: a floating gripper at the pick closes, lifts and turns the object, and holds it for 2 s. Place: the object is
+    reset to the motion M of its start, and after 2 s it touches the target and not the table; a bowl or a bottle is
+    within 15 degrees of upright; and with gravity reversed it comes off the target, so that neither is stuck in the
+    other.
+
+    Args:
+        episode: the episode.
+        robot: the robot, whose gripper floats.
+        pick: pose of the gripper's frame at the pick, 4x4, metres, world frame.
+        motion: motion M of the object: a point x of it ends at M x, 4x4.
+        bodies: bodies of the episode, if they are there already.
+    """
+    bodies = Bodies.of(episode) if bodies is None else bodies
+    release = motion @ pick
+    grasp = test_grasp(
+        robot,
+        bodies.object,
+        episode.T_world_object,
+        pick,
+        episode.grip.opening,
+        rotation=release[:3, :3],
+        fixture=episode.fixture,
+    )
+    placed, hung, cause, detail = _reset(episode, bodies, motion @ episode.T_world_object)
+    if not grasp.held:
+        wrong = _pick_error(episode, pick)
+        cause = "pick wrong" if wrong else "slipped"
+        detail = wrong or f"{1e3 * grasp.slip:.0f} mm and {grasp.turn:.0f} degrees in the hand"
+    overall = grasp.held and placed
+    return Outcome(grasp.held, placed, overall, overall and hung, "" if overall and hung else cause, detail, grasp.slip, grasp.turn)
+
+
+def run_episode(
+    episode: Episode,
+    robot: Robot,
+    candidates: Sequence[Float[np.ndarray, "poses 4 4"]],
+    bodies: "Bodies | None" = None,
+    seed: int = 1,
+    watch=None,
+) -> Outcome:
+    """Execute the first trajectory that can be planned, from home to home, and look where the object ended.
+
+    Args:
+        episode: the episode.
+        robot: the robot.
+        candidates: trajectories of the gripper's frame from the pick to the release, the best first.
+        bodies: bodies of the episode, if they are there already.
+        seed: seed of the planner.
+        watch: called every few steps with the cell, the state and the phase, such as `Recorder`.
+    """
+    bodies = Bodies.of(episode) if bodies is None else bodies
+    cell = build_workcell(
+        robot,
+        bodies.object,
+        episode.T_world_object,
+        bodies.target,
+        episode.T_world_target,
+        fixture=episode.fixture,
+        fixed_target=TASKS[episode.task].fixed,
+    )
+    plan = plan_motion(candidates, robot, opening=episode.grip.opening, grip=0.0, cell=cell, seed=seed)
+    wrong = _pick_error(episode, np.asarray(candidates[0][0]))
+    if isinstance(plan, Failure):
+        return _failed("pick wrong" if wrong else "unreachable", wrong or plan.reason)
+    data = cell.data()
+    observer = _Observer(cell, watch)
+    execute(cell, data, plan.motion, observer)
+    _settle(cell, data)
+    placed, hung, cause, detail = _judged(episode, cell, data)
+    slip, turn = observer.moved_in_hand()
+    held = observer.held and slip < MOST_SLIP * 3
+    if observer.collided:
+        placed, cause, detail = False, "collided", observer.collided
+    elif not placed or not hung:
+        if not observer.held:
+            cause, detail = ("pick wrong", _pick_error(episode, plan.pick)) if _pick_error(episode, plan.pick) else ("lost in transit", observer.lost)
+        elif slip > MOST_SLIP or turn > MOST_TURN:
+            cause, detail = "slipped", f"{1e3 * slip:.0f} mm and {turn:.0f} degrees in the hand; {detail}"
+        elif observer.struck:
+            cause, detail = "hit the target on approach", f"{observer.struck}; {detail}"
+    overall = held and placed
+    return Outcome(held, placed, overall, overall and hung, "" if overall and hung else cause, detail, slip, turn)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Bodies:
+    """The bodies of an episode.
+
+    Attributes:
+        object, target: the two.
+    """
+
+    object: Body
+    target: Body
+
+    @classmethod
+    def of(cls, episode: Episode, mass: float | None = None) -> "Bodies":
+        """Make them; `mass` is that of the object, kg, by default by its volume."""
+        return cls(body_of(episode.object, mass), body_of(episode.target))
+
+
+class _Observer:
+    """Watches an episode: what the arm touches, and whether the object stays in the hand."""
+
+    def __init__(self, cell: Workcell, watch):
+        self.cell, self.watch = cell, watch
+        self.kinds = geom_kinds(cell)
+        self.collided, self.struck, self.lost, self.held = "", "", "", True
+        self.closed: np.ndarray | None = None
+        self.last: np.ndarray | None = None
+
+    def __call__(self, data, step: int, phase: str) -> None:
+        model = self.cell.model
+        if phase == "path" and self.closed is None:
+            if any(model.equality(number).name == FIXTURE for number in range(model.neq)):
+                data.eq_active[model.equality(FIXTURE).id] = 0
+            self.closed = self._in_hand(data)
+        if step % WATCHED:
+            return
+        pairs = {tuple(pair) for pair in np.sort(self.kinds[data.contact.geom[: data.ncon]], axis=1).tolist()}
+        if not self.collided:
+            for a, b, words in (
+                (ARM, TABLE_KIND, "the arm touches the table"),
+                (HAND_KIND, TABLE_KIND, "the gripper touches the table"),
+                (ARM, TARGET_KIND, "the arm touches the target"),
+                (ARM, OBJECT_KIND, "the arm touches the object"),
+            ):
+                if (a, b) in pairs or (b, a) in pairs:
+                    self.collided = f"{words} ({phase})"
+        if not self.struck and phase in ("path", "approach") and (HAND_KIND, TARGET_KIND) in pairs:
+            self.struck = f"the gripper touches the target ({phase})"
+        if phase == "path":
+            self.last = self._in_hand(data)
+            if (HAND_KIND, OBJECT_KIND) not in pairs and self.held:
+                self.held, self.lost = False, "the fingers let go on the way"
+        if self.watch is not None:
+            self.watch(self.cell, data, phase)
+
+    def moved_in_hand(self) -> tuple[float, float]:
+        """Movement of the object in the hand from closing to the release, metres and degrees."""
+        if self.closed is None or self.last is None:
+            return np.nan, np.nan
+        moved = np.linalg.inv(self.closed) @ self.last
+        centre = self.cell.model.body(OBJECT).ipos
+        return (
+            float(np.linalg.norm((self.last - self.closed)[:3, :3] @ centre + (self.last - self.closed)[:3, 3])),
+            float(np.degrees(Rotation.from_matrix(moved[:3, :3]).magnitude())),
+        )
+
+    def _in_hand(self, data) -> np.ndarray:
+        return np.linalg.inv(self.cell.gripper_pose(data)) @ self.cell.body_pose(data, OBJECT)
+
+
+def _reset(episode: Episode, bodies: Bodies, T_world_object) -> tuple[bool, bool, str, str]:
+    """Reset the object, let 2 s pass, and judge."""
+    mujoco = extra("teleport()", "mujoco")
+    cell = build_workcell(
+        None,
+        bodies.object,
+        T_world_object,
+        bodies.target,
+        episode.T_world_target,
+        fixed_target=TASKS[episode.task].fixed,
+    )
+    data = cell.data()
+    _settle(cell, data)
+    verdict = _judged(episode, cell, data)
+    if not verdict[0]:
+        return verdict
+    # The target stays where it is, and there is no table.
+    T_object, T_target = cell.body_pose(data, OBJECT), cell.body_pose(data, TARGET)
+    turned = build_workcell(None, bodies.object, T_object, bodies.target, T_target, table=False)
+    turned.model.opt.gravity[2] *= -1
+    data = turned.data()
+    for _ in range(int(UPSIDE_DOWN / TIMESTEP)):
+        mujoco.mj_step(turned.model, data)
+    if np.linalg.norm(turned.body_pose(data, OBJECT)[:3, 3] - T_object[:3, 3]) < FALLS:
+        return False, verdict[1], "stuck", "with gravity reversed the object stays on the target"
+    return verdict
+
+
+def _settle(cell: Workcell, data: Any) -> None:
+    """Let 2 s pass."""
+    mujoco = extra("run_episode()", "mujoco")
+    for _ in range(int(SETTLE / TIMESTEP)):
+        mujoco.mj_step(cell.model, data)
+
+
+def _judged(episode: Episode, cell: Workcell, data: Any) -> tuple[bool, bool, str, str]:
+    """Whether the object is placed, whether a mug hangs from its handle, and what is wrong."""
+    kinds = geom_kinds(cell)
+    pairs = {tuple(pair) for pair in np.sort(kinds[data.contact.geom[: data.ncon]], axis=1).tolist()}
+    T_target_object = np.linalg.inv(cell.body_pose(data, TARGET)) @ cell.body_pose(data, OBJECT)
+    hung = True
+    if episode.object.category == "mug":
+        mug, rack = cast(Mug, episode.object), cast(Rack, episode.target)
+        hung = any(hole_is_crossed(mug, line, T_target_object) for line in rack.peg_lines)
+    if (OBJECT_KIND, TARGET_KIND) not in pairs:
+        return False, hung, "fell", "the object does not touch the target"
+    if (OBJECT_KIND, TABLE_KIND) in pairs:
+        return False, hung, "fell", "the object touches the table"
+    if np.linalg.norm(data.joint(OBJECT).qvel[:3]) > MOVING:
+        return False, hung, "not settled", f"the object still moves after {SETTLE:g} s"
+    tilt = float(np.degrees(np.arccos(np.clip(cell.body_pose(data, OBJECT)[2, 2], -1, 1))))
+    if episode.object.category != "mug" and tilt > UPRIGHT:
+        return False, hung, "not upright", f"{tilt:.0f} degrees from upright"
+    return True, hung, "" if hung else "not on the peg", "" if hung else "no peg goes through the finger hole"
+
+
+def _pick_error(episode: Episode, pick) -> str:
+    """What is wrong with a pick, in words; empty if it is near a true one, up to the turn about a round object's axis."""
+    local = np.linalg.inv(episode.T_world_object) @ pick
+    true = episode.grip.T_object_grip
+    turns = np.linspace(0, 2 * np.pi, 180, endpoint=False) if episode.object.fold == 0 else [0.0]
+    if episode.object.fold in (2, 4):
+        turns = np.arange(episode.object.fold) * 2 * np.pi / episode.object.fold
+    best = (np.inf, np.inf)
+    for turn in turns:
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_euler("z", turn).as_matrix()
+        for half in (np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0])):
+            error = np.linalg.inv(T @ true @ half) @ local
+            angle = float(np.degrees(Rotation.from_matrix(error[:3, :3]).magnitude()))
+            best = min(best, (float(np.linalg.norm(error[:3, 3])) + angle / 1e3, angle))
+    distance = best[0] - best[1] / 1e3
+    if distance > WRONG_PICK[0] or best[1] > WRONG_PICK[1]:
+        return f"{1e2 * distance:.1f} cm and {best[1]:.0f} degrees from a true pick"
+    return ""
+
+
+def _failed(cause: str, detail: str) -> Outcome:
+    return Outcome(False, False, False, False, cause, detail, np.nan, np.nan)

@@ -1,0 +1,92 @@
+"""Inverse kinematics of an arm: joints that bring the gripper's frame to a pose, and along a path of poses."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from tdf_jax.sim.physics import compiled, extra, set_options
+from tdf_jax.sim.robot import PREFIX, Robot
+
+# A pose is reached within these errors: scattered positions along a path would make the arm shake, and so be slow.
+POSITION_TOLERANCE, ROTATION_TOLERANCE = 2e-5, 1e-4  # metres, radians
+ITERATIONS, FOLLOWING = 40, 12  # of a search from anywhere, and from the pose before
+DAMPING = 1e-6
+
+
+@functools.lru_cache(maxsize=4)
+def kinematics_of(robot: Robot) -> "Kinematics":
+    """The kinematics of a robot, compiled once."""
+    return Kinematics(robot)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Kinematics:
+    """The arm alone, for inverse kinematics by mink.
+
+    Attributes:
+        robot: the robot; it stands at the origin as in a scene.
+    """
+
+    robot: Robot
+
+    @functools.cached_property
+    def _model(self) -> Any:
+        mujoco = extra("Kinematics", "mujoco")
+        spec = mujoco.MjSpec()
+        set_options(spec)
+        yaw = self.robot.yaw
+        spec.attach(
+            self.robot.spec(), prefix=PREFIX, frame=spec.worldbody.add_frame(quat=(np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)))
+        )
+        # The fingers' joints would only make every step slower.
+        fixed = [one for one in spec.joints if one.name.removeprefix(PREFIX) not in self.robot.joints]
+        for one in [*spec.keys, *spec.equalities, *spec.tendons, *spec.actuators, *fixed]:
+            spec.delete(one)
+        return compiled(spec)
+
+    @functools.cached_property
+    def _tools(self) -> Any:
+        mink = extra("Kinematics", "mink")
+        configuration = mink.Configuration(self._model)
+        task = mink.FrameTask(PREFIX + self.robot.site, "site", position_cost=1.0, orientation_cost=1.0, lm_damping=1e-6)
+        limits = [mink.ConfigurationLimit(self._model)]
+        arm = [int(self._model.joint(PREFIX + name).qposadr[0]) for name in self.robot.joints]
+        return mink, configuration, task, limits, arm
+
+    def pose(self, joints: Float[np.ndarray, " joints"]) -> Float[np.ndarray, "4 4"]:
+        """Pose of the gripper's frame, 4x4, metres, world frame, at positions of the joints, radians."""
+        _, configuration, _, _, arm = self._tools
+        configuration.update(self._full(joints, arm))
+        return np.asarray(configuration.get_transform_frame_to_world(PREFIX + self.robot.site, "site").as_matrix())
+
+    def solve(
+        self, T: Float[np.ndarray, "4 4"], start: Float[np.ndarray, " joints"], iterations: int = ITERATIONS
+    ) -> Float[np.ndarray, " joints"] | None:
+        """Positions of the joints at which the gripper's frame has a pose, within their limits.
+
+        Args:
+            T: the pose, 4x4, metres, world frame.
+            start: positions to begin at, (joints,), radians.
+            iterations: largest number of iterations.
+
+        Returns:
+            The positions, (joints,), radians; None if the search did not reach the pose.
+        """
+        mink, configuration, task, limits, arm = self._tools
+        configuration.update(self._full(start, arm))
+        task.set_target(mink.SE3.from_matrix(np.asarray(T, float)))
+        for _ in range(iterations):
+            error = task.compute_error(configuration)
+            if np.linalg.norm(error[:3]) < POSITION_TOLERANCE and np.linalg.norm(error[3:]) < ROTATION_TOLERANCE:
+                return configuration.q[arm].copy()
+            velocity = mink.solve_ik(configuration, [task], 1.0, "daqp", damping=DAMPING, limits=limits)
+            configuration.integrate_inplace(velocity, 1.0)
+        return None
+
+    def _full(self, joints, arm) -> np.ndarray:
+        q = np.zeros(self._model.nq)
+        q[arm] = joints
+        return q

@@ -1,0 +1,329 @@
+"""Motions of a robot along a trajectory: approach, grasp, path, release and retreat, as joints over time."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation, Slerp
+
+from tdf_jax._internal import checks
+from tdf_jax._internal.errors import InputError
+from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.sim.collision import Collisions
+from tdf_jax.sim.joint_trajectory import JointTrajectory
+from tdf_jax.sim.kinematics import FOLLOWING, Kinematics, kinematics_of
+from tdf_jax.sim.retiming import retime
+from tdf_jax.sim.robot import Robot
+from tdf_jax.sim.workcell import Workcell
+from tdf_jax.sim.transit import connect
+
+APPROACH = 0.10  # metres along the approach before the pick, and back after the release
+SPACING, TURN = 0.005, 0.05  # metres and radians between poses for which the joints are computed
+MAX_STEP = 0.35  # radians, largest step of a joint between them; a larger one is another posture of the arm
+SEARCHES = 24  # starts of the search for postures at the pick
+SAME = 0.05  # radians, postures nearer than this are one
+CLOSE_SECONDS, OPEN_SECONDS = 1.0, 0.6  # to close the fingers and to open them
+RATE = 125.0  # samples per second
+# Penetrations that a plan may have, metres. Clouds and fields know surfaces to a millimetre or two.
+TOUCHING = 0.002
+RESTING = 0.006  # of the object and what it stands on or is placed on, near both ends
+ENDS = 0.08  # metres from an end in which the object may touch its support or the target
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Plan:
+    """A planned motion.
+
+    Attributes:
+        motion: the joints over time.
+        pick, release: poses of the gripper's frame at both ends, 4x4, metres, world frame.
+        candidate: number of the candidate that is executed.
+        poses: poses of the gripper's frame from the pick to the release, (poses, 4, 4).
+    """
+
+    motion: JointTrajectory
+    pick: Float[np.ndarray, "4 4"]
+    release: Float[np.ndarray, "4 4"]
+    candidate: int
+    poses: Float[np.ndarray, "poses 4 4"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Failure:
+    """Why there is no motion.
+
+    Attributes:
+        reason: in words, of the candidate that came farthest.
+    """
+
+    reason: str
+
+
+def plan_joints(
+    trajectory: Trajectory,
+    robot: Robot,
+    *,
+    opening: float | None = None,
+    grip: float = 0.0,
+    cell: Workcell | None = None,
+    T_world_object: Float[np.ndarray, "4 4"] | None = None,
+    approach: float = APPROACH,
+    seed: int = 1,
+) -> JointTrajectory:
+    """Plan the joints of a robot along a trajectory of its gripper: to the pick, along the path, and back home.
+
+    The robot goes from home to a pose behind the pick, straight to the pick, closes, follows the trajectory (straight
+    lines and geodesics between its poses), opens, retreats along the approach and goes home. The first posture of the
+    arm for which everything is within the limits and free of collisions is taken.
+
+    Args:
+        trajectory: poses of the gripper's frame from the pick to the release: z along the approach, y along the closing
+            direction, as of `tdf_jax.gripper_query`.
+        robot: the robot; see `load_robot`.
+        opening: opening of the fingers before the grasp and after the release, metres; by default the widest.
+        grip: opening that is commanded to hold, metres: less than the width of what is held.
+        cell: the cell to stay clear of; nothing by default.
+        T_world_object: pose of the cell's object at the pick, 4x4; where it starts by default. The object is held from
+            the pick on.
+        approach: length of the straight motions before the pick and after the release, metres.
+        seed: seed of the planner of the free motions, at least 1.
+
+    Returns:
+        The motion.
+
+    Raises:
+        InputError: the extra "sim" is not installed, there is no such motion (with the reason), or an argument is
+            wrong.
+    """
+    if not isinstance(trajectory, Trajectory) or np.asarray(trajectory.wxyz_xyz).ndim != 2:
+        raise InputError("plan_joints(): trajectory is not one trajectory; expected Trajectory of shape (poses, 7)")
+    if not isinstance(robot, Robot):
+        raise InputError(f"plan_joints(): robot is {type(robot).__name__}; expected load_robot()")
+    checks.positive("plan_joints()", "approach", approach, "metres")
+    checks.count("plan_joints()", "seed", seed)
+    wide = robot.fingers.widest if opening is None else float(opening)
+    if not 0 <= grip < wide <= robot.fingers.widest + 1e-6:
+        raise InputError(
+            f"plan_joints(): opening is {wide} and grip {grip}; expected 0 <= grip < opening <= "
+            f"{robot.fingers.widest:.4f} m, the widest opening of {robot.name}"
+        )
+    poses = np.asarray(trajectory.matrices, float)
+    plan = plan_motion([poses], robot, opening=wide, grip=grip, cell=cell, approach=approach, seed=seed)
+    if isinstance(plan, Failure):
+        raise InputError(f"plan_joints(): there is no motion: {plan.reason}")
+    return plan.motion
+
+
+def plan_motion(
+    candidates: Sequence[Float[np.ndarray, "poses 4 4"]],
+    robot: Robot,
+    *,
+    opening: float,
+    grip: float,
+    cell: Workcell | None = None,
+    approach: float = APPROACH,
+    seed: int = 1,
+) -> Plan | Failure:
+    """Plan the first of several trajectories that the robot can follow; see `plan_joints`.
+
+    Args:
+        candidates: trajectories of the gripper's frame, the best first, (poses, 4, 4) each. Each is tried as it is and
+            turned by half a turn about the approach, which is the same for a parallel gripper.
+        robot: the robot.
+        opening: opening before the grasp and after the release, metres.
+        grip: opening that is commanded to hold, metres.
+        cell: the cell to stay clear of.
+        approach: length of the straight motions before the pick and after the release, metres.
+        seed: seed of the planner of the free motions.
+
+    Returns:
+        The plan, or why there is none.
+    """
+    kinematics = kinematics_of(robot)
+    collisions = None if cell is None else Collisions(cell)
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    reasons: list[tuple[int, str]] = []
+    for number, poses in enumerate(candidates):
+        for turned in (np.asarray(poses, float), np.asarray(poses, float) @ half_turn):
+            path = _Path(turned, approach)
+            for posture in _postures(kinematics, path.poses[path.pick]):
+                found = _followed(kinematics, path, posture)
+                if found is None:
+                    reasons.append((1, "the arm cannot follow the path within its limits"))
+                    continue
+                blocked = None if collisions is None else _blocked(collisions, path, found, opening, grip)
+                if blocked is not None:
+                    reasons.append((2, blocked))
+                    continue
+                transits = _transits(robot, collisions, path, found, opening, seed)
+                if transits is None:
+                    reasons.append((3, f"no free motion from home and back (RRT-Connect, seed {seed})"))
+                    continue
+                motion = _timed(robot, path, found, transits, opening, grip)
+                return Plan(motion, turned[0], turned[-1], number, turned)
+    if not reasons:
+        return Failure("the pick has no posture of the arm within its limits: it is out of reach")
+    return Failure(max(reasons)[1])
+
+
+class _Path:
+    """Dense poses of the gripper's frame, from behind the pick to behind the release."""
+
+    def __init__(self, poses: np.ndarray, approach: float):
+        behind = np.eye(4)
+        behind[2, 3] = -approach
+        corners = np.concatenate([[poses[0] @ behind], poses, [poses[-1] @ behind]])
+        rows, at = [corners[:1]], [0]
+        for start, end in zip(corners[:-1], corners[1:]):
+            rows.append(_between(start, end))
+            at.append(at[-1] + len(rows[-1]))
+        self.poses = np.concatenate(rows)
+        self.pick, self.release = at[1], at[-2]
+
+
+def _between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Poses on the straight line and geodesic after one pose up to the next."""
+    rotations = Rotation.from_matrix(np.stack([start[:3, :3], end[:3, :3]]))
+    angle = (rotations[0].inv() * rotations[1]).magnitude()
+    distance = np.linalg.norm(end[:3, 3] - start[:3, 3])
+    count = max(1, int(np.ceil(max(distance / SPACING, angle / TURN))))
+    shares = np.arange(1, count + 1) / count
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = Slerp([0.0, 1.0], rotations)(shares).as_matrix()
+    poses[:, :3, 3] = start[:3, 3] + shares[:, None] * (end[:3, 3] - start[:3, 3])
+    return poses
+
+
+def _postures(kinematics: Kinematics, T) -> Iterator[np.ndarray]:
+    """Distinct postures of the arm at a pose: what is found from home, then from anywhere."""
+    robot = kinematics.robot
+    rng = np.random.default_rng(0)
+    found: list[np.ndarray] = []
+    for number in range(1 + SEARCHES):
+        start = robot.home + (rng.uniform(-np.pi, np.pi, robot.num_joints) if number else 0.0)
+        solution = kinematics.solve(T, np.clip(start, robot.lower, robot.upper))
+        if solution is not None:
+            wrapped = _near(robot, solution)
+            if all(np.abs(wrapped - other).max() > SAME for other in found):
+                found.append(wrapped)
+                yield wrapped
+
+
+def _near(robot: Robot, joints: np.ndarray) -> np.ndarray:
+    """The same posture, with whole turns of the joints towards home where the limits allow it."""
+    turns = np.round((joints - robot.home) / (2 * np.pi))
+    moved = joints - 2 * np.pi * turns
+    return np.where((moved >= robot.lower) & (moved <= robot.upper), moved, joints)
+
+
+def _followed(kinematics: Kinematics, path: _Path, posture: np.ndarray) -> np.ndarray | None:
+    """Joints along a path from a posture at the pick, in both directions; None if the arm cannot follow."""
+    joints = np.empty((len(path.poses), len(posture)))
+    joints[path.pick] = posture
+    ways = (range(path.pick - 1, -1, -1), range(path.pick + 1, len(path.poses)))
+    for way in ways:
+        last = posture
+        for row in way:
+            solution = kinematics.solve(path.poses[row], last, FOLLOWING)
+            if solution is None or np.abs(solution - last).max() > MAX_STEP:
+                return None
+            joints[row] = last = solution
+    return joints
+
+
+def _blocked(collisions: Collisions, path: _Path, joints, opening: float, grip: float) -> str | None:
+    """The first collision along a path, in words."""
+    data = collisions.cell.data()
+    T_object = collisions.cell.body_pose(data, "object") if collisions.cell.model.nbody and _has(collisions) else None
+    pick = path.poses[path.pick]
+    T_gripper_object = None if T_object is None else np.linalg.inv(pick) @ T_object
+    lengths = np.linalg.norm(np.diff(path.poses[:, :3, 3], axis=0, prepend=path.poses[:1, :3, 3]), axis=1).cumsum()
+    for row in range(len(joints)):
+        held = path.pick < row <= path.release
+        placed = row > path.release
+        T = T_object
+        if T_gripper_object is not None and (held or placed):
+            T = path.poses[min(row, path.release)] @ T_gripper_object
+        depths = collisions.depths(joints[row], opening, T)
+        near_pick = lengths[row] - lengths[path.pick] < ENDS
+        near_release = lengths[path.release] - lengths[row] < ENDS
+        where = "to the pick" if row <= path.pick else ("along the path" if held else "on the retreat")
+        for (a, b), depth in depths.items():
+            pair = {a, b}
+            if pair <= {"hand", "arm"} or pair == {"object", "hand"} and held:
+                continue
+            if pair == {"target", "table"} or pair == {"object"} or pair == {"arm"}:
+                continue
+            allowed = TOUCHING
+            if pair == {"object", "table"} and (near_pick or near_release or not held):
+                allowed = np.inf if not held else RESTING
+            elif pair == {"object", "target"} and (near_release or not held):
+                allowed = np.inf if not held else RESTING
+            if depth > allowed:
+                return f"{a} and {b} collide {where} (by {1e3 * depth:.0f} mm)"
+    return None
+
+
+def _has(collisions: Collisions) -> bool:
+    model = collisions.cell.model
+    return any(model.body(number).name == "object" for number in range(model.nbody))
+
+
+def _transits(robot: Robot, collisions, path: _Path, joints, opening: float, seed: int):
+    """Free paths from home to the first pose and from the last pose home."""
+    if collisions is None:
+        return np.stack([robot.home, joints[0]]), np.stack([joints[-1], robot.home])
+    cell = collisions.cell
+    T_start = cell.body_pose(cell.data(), "object") if _has(collisions) else None
+    T_end = None if T_start is None else path.poses[path.release] @ np.linalg.inv(path.poses[path.pick]) @ T_start
+
+    def free_with(T):
+        def free(positions):
+            depths = collisions.depths(positions, opening, T)
+            return all(
+                pair in (("object", "table"), ("object", "target"), ("target", "table"), ("object", "object"))
+                for pair in depths
+            )
+
+        return free
+
+    there = connect(robot.home, joints[0], robot.lower, robot.upper, free_with(T_start), seed)
+    back = connect(joints[-1], robot.home, robot.lower, robot.upper, free_with(T_end), seed)
+    return None if there is None or back is None else (there, back)
+
+
+def _timed(robot: Robot, path: _Path, joints, transits, opening: float, grip: float) -> JointTrajectory:
+    """The whole motion: every phase from rest to rest, with time for the fingers."""
+    there, back = transits
+    phases = (
+        ("transit", there, opening),
+        ("approach", joints[: path.pick + 1], opening),
+        ("grasp", joints[path.pick][None], grip),
+        ("path", joints[path.pick : path.release + 1], grip),
+        ("release", joints[path.release][None], opening),
+        ("retreat", joints[path.release :], opening),
+        ("return", back, opening),
+    )
+    times, positions, gripper, segments = [], [], [], []
+    now = 0.0
+    for name, waypoints, width in phases:
+        if name in ("grasp", "release"):
+            seconds = CLOSE_SECONDS if name == "grasp" else OPEN_SECONDS
+            t = np.arange(int(seconds * RATE) + 1) / RATE
+            q = np.repeat(waypoints, len(t), axis=0)
+        else:
+            t, q = retime(waypoints, robot.max_velocity, robot.max_acceleration, RATE)
+        segments.append((name, sum(len(part) for part in times)))
+        keep = slice(0, None) if not times else slice(1, None)  # a phase begins where the one before ended
+        times.append(now + t[keep])
+        positions.append(q[keep])
+        gripper.append(np.full(len(t[keep]), width))
+        now += float(t[-1])
+    return JointTrajectory(
+        times=np.concatenate(times),
+        positions=np.concatenate(positions),
+        joint_names=robot.joints,
+        gripper=np.concatenate(gripper),
+        segments=tuple(segments),
+    )

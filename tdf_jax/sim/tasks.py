@@ -1,0 +1,212 @@
+"""Tasks of simulated episodes: what is picked, where it goes, and where objects start, drawn before any method runs."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from tdf_jax._internal import checks
+from tdf_jax._internal.errors import InputError
+from tdf_jax.evaluation.cases import SEED_SPACE
+from tdf_jax.evaluation.relation_tasks import CONTACT_QUERIES, CONTACT_SIZE, RELATIONS, TILT, draw_pair, moved
+from tdf_jax.geometry import se3
+from tdf_jax.geometry.demonstration import Demonstration
+from tdf_jax.geometry.paths import hang_on_rack, lift_over
+from tdf_jax.geometry.query import box_query, gripper_query
+from tdf_jax.geometry.sampling import sample_surface
+from tdf_jax.geometry.target import Target
+from tdf_jax.shapes import FAMILIES, Shape
+from tdf_jax.sim.board import Board
+from tdf_jax.sim.grasps import Grip, grip_of
+from tdf_jax.sim.kinematics import kinematics_of
+from tdf_jax.sim.robot import Robot
+
+POSES = ("upright", "tilt60", "uniform")
+OBJECTS = ((0.38, 0.56), (0.10, 0.32))  # metres, x and y on the table where objects start
+TARGETS = ((0.40, 0.56), (-0.32, -0.12))  # and targets
+ABOVE = 0.12  # metres above the table of the lowest point of an object that a fixture holds
+NUM_POSES = 24
+APPROACH = 0.10  # metres along a peg, or down, at the end of a demonstrated path
+CLEARANCE = 0.06  # metres, height of a lift over the target's top
+GRIPPER_POINTS = 256
+MOST_DRAWS = 400
+SEARCHES = 12  # starts of the search for a posture of the arm at the true pick and at the true release
+
+
+class Task(NamedTuple):
+    """A task.
+
+    Attributes:
+        object: category of the object.
+        target: category of the target; "board" for a board, which is always known.
+        fixed: whether the target is fixed to the world; otherwise it stands by its weight.
+    """
+
+    object: str
+    target: str
+    fixed: bool
+
+
+TASKS = {
+    "mug_on_rack": Task("mug", "rack", True),
+    "bowl_on_shelf": Task("bowl", "board", True),
+    "bottle_on_shelf": Task("bottle", "board", True),
+    "bowl_on_mug": Task("bowl", "mug", False),
+    "bottle_in_container": Task("bottle", "container", False),
+}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Episode:
+    """What is drawn of an episode.
+
+    Attributes:
+        task: name in `TASKS`.
+        number: number of the episode.
+        poses: how the object starts, one of `POSES`.
+        object: the object, in its canonical frame.
+        target: the target, in its canonical frame; it stands upright.
+        T_world_object: pose of the object at the start, 4x4, metres, world frame.
+        T_world_target: pose of the target, 4x4.
+        T_target_object: a true seated pose of the object on the target, 4x4.
+        T_target_contact: frame of the region where the two meet, 4x4.
+        grip: the demonstrated grasp of this object.
+        rejected: number of starts drawn before that the robot cannot reach.
+        redrawn: number of pairs drawn before that cannot fit.
+    """
+
+    task: str
+    number: int
+    poses: str
+    object: Shape
+    target: Shape | Board
+    T_world_object: Float[np.ndarray, "4 4"]
+    T_world_target: Float[np.ndarray, "4 4"]
+    T_target_object: Float[np.ndarray, "4 4"]
+    T_target_contact: Float[np.ndarray, "4 4"]
+    grip: Grip
+    rejected: int
+    redrawn: int
+
+    @property
+    def fixture(self) -> bool:
+        """Whether a fixture holds the object until the fingers have closed: it does not stand by itself."""
+        return self.poses != "upright"
+
+    @property
+    def pick(self) -> Float[np.ndarray, "4 4"]:
+        """The true pick: pose of the gripper's frame, 4x4, world frame."""
+        return self.T_world_object @ self.grip.T_object_grip
+
+    @property
+    def release(self) -> Float[np.ndarray, "4 4"]:
+        """The true release: pose of the gripper's frame, 4x4, world frame."""
+        return self.T_world_target @ self.T_target_object @ self.grip.T_object_grip
+
+
+def draw_episode(task: str, robot: Robot, seed: int, number: int, poses: str = "upright") -> Episode:
+    """Draw an episode: the pair, and a start from which the true pick and the true release are within reach.
+
+    Args:
+        task: one of `TASKS`.
+        robot: the robot.
+        seed: seed of the episodes.
+        number: number of the episode.
+        poses: "upright" on the table with any yaw; "tilt60" with roll and pitch within 60 degrees too, or "uniform",
+            both held by a fixture above the table.
+
+    Raises:
+        InputError: there is no such task or poses, or nothing within reach is drawn.
+    """
+    checks.choice("draw_episode()", "task", task, TASKS)
+    checks.choice("draw_episode()", "poses", poses, POSES)
+    one, target, T_target_object, T_target_contact, redrawn = _pair(task, seed, number)
+    grip = grip_of(one, robot.fingers)
+    rng = np.random.default_rng([SEED_SPACE, seed, number, 7])
+    for rejected in range(MOST_DRAWS):
+        T_world_object, T_world_target = _start(one, poses, rng), _standing(target.mesh, TARGETS, rng)
+        made = Episode(
+            task, number, poses, one, target, T_world_object, T_world_target, T_target_object, T_target_contact, grip,
+            rejected, redrawn,
+        )  # fmt: skip
+        if within_reach(robot, [made.pick, made.release]):
+            return made
+    raise InputError(f"draw_episode(): no start of {task} {number} (seed {seed}) is within reach in {MOST_DRAWS} draws")
+
+
+def within_reach(robot: Robot, poses) -> bool:
+    """Whether the arm has a posture at every pose of the gripper's frame, as it is or turned by half a turn."""
+    kinematics, rng = kinematics_of(robot), np.random.default_rng(0)
+    for T in poses:
+        turned = T @ np.diag([-1.0, -1.0, 1.0, 1.0])
+        starts = [robot.home] + [robot.home + rng.uniform(-2, 2, robot.num_joints) for _ in range(SEARCHES)]
+        if not any(kinematics.solve(one, start) is not None for start in starts for one in (T, turned)):
+            return False
+    return True
+
+
+def demonstrate_episode(episode: Episode, seed: int, points: int = 1500) -> Demonstration:
+    """The demonstration that an episode's true pick and release are.
+
+    Args:
+        episode: an episode whose object stands upright.
+        seed: seed of the clouds. Query points are the same for all, so that demonstrations combine.
+        points: number of points of each cloud.
+    """
+    rng = np.random.default_rng([SEED_SPACE, seed, episode.number, 8])
+    pick, release = episode.pick, episode.release
+    ends = {"rotation": pick[:3, :3], "end_rotation": release[:3, :3]}
+    T_world_contact = episode.T_world_target @ episode.T_target_contact
+    if episode.task == "mug_on_rack":
+        along = -APPROACH * T_world_contact[:3, 0]
+        path = hang_on_rack(NUM_POSES, pick[:3, 3], release[:3, 3], approach=along, **ends)
+    else:
+        height = float(episode.target.mesh.extents[2]) + CLEARANCE
+        path = lift_over(NUM_POSES, pick[:3, 3], release[:3, 3], height=height, **ends)
+    key = jax.random.key(0)
+    return Demonstration(
+        points=moved(sample_surface(episode.object.mesh, points, rng), episode.T_world_object).astype(np.float32),
+        trajectory=path,
+        query=gripper_query(key, GRIPPER_POINTS, opening=episode.grip.opening),
+        target=Target(
+            points=moved(sample_surface(episode.target.mesh, points, rng), episode.T_world_target).astype(np.float32),
+            query=box_query(jax.random.fold_in(key, 1), CONTACT_QUERIES, CONTACT_SIZE),
+            T_world_contact=np.asarray(se3.pose(T_world_contact[:3, :3], T_world_contact[:3, 3])),
+        ),
+    )
+
+
+def _pair(task: str, seed: int, number: int):
+    if task in RELATIONS:
+        pair = draw_pair(task, seed, number)
+        return pair.object, pair.target, pair.T_target_object, pair.T_target_contact, pair.redrawn
+    family = FAMILIES[TASKS[task].object]
+    one = family.build(family.sample(np.random.default_rng([SEED_SPACE, seed, number, 3])))
+    board = Board()
+    top = np.eye(4)
+    top[2, 3] = board.mesh.bounds[1, 2]
+    standing = top.copy()
+    standing[2, 3] -= one.mesh.bounds[0, 2]
+    return one, board, standing, top, 0
+
+
+def _start(one: Shape, poses: str, rng) -> np.ndarray:
+    if poses == "upright":
+        return _standing(one.mesh, OBJECTS, rng)
+    T = np.eye(4)
+    yaw, roll, pitch = rng.uniform(-np.pi, np.pi), rng.uniform(-TILT, TILT), rng.uniform(-TILT, TILT)
+    anywhere = Rotation.random(rng=rng)
+    T[:3, :3] = (Rotation.from_euler("ZYX", (yaw, pitch, roll)) if poses == "tilt60" else anywhere).as_matrix()
+    T[:2, 3] = [rng.uniform(*side) for side in OBJECTS]
+    T[2, 3] = ABOVE - (one.mesh.vertices @ T[:3, :3].T)[:, 2].min()
+    return T
+
+
+def _standing(mesh, area, rng) -> np.ndarray:
+    yaw, T = rng.uniform(-np.pi, np.pi), np.eye(4)
+    T[:3, :3] = Rotation.from_euler("z", yaw).as_matrix()
+    T[:3, 3] = [rng.uniform(*area[0]), rng.uniform(*area[1]), -mesh.bounds[0, 2]]
+    return T
