@@ -16,14 +16,15 @@ from tdf_jax.shapes.container import Container
 from tdf_jax.shapes.shape import Shape
 from tdf_jax.shapes.solid import Bar, Part, Tube, rings, tube_rings
 
-_TOLERANCE = 4e-4  # intended distance of the parts' surface from the true one, metres, on either side
+_TOLERANCE = 4.5e-4  # intended distance of the parts' surface from the true one, metres, on either side
+_BEND = 4.2e-4  # the same for handles
 _FINE = 3e-5  # distance by which profiles and outlines are simplified, metres
 _OUTER = 8e-5  # the same for the outside of a wall, whose every corner costs time in contact
 _CORNERS = 64  # most corners of a part
 _STEP = 1.5e-4  # rings closer than this, metres, are the step of a cap; a part between them would be a needle
 _THINNEST = 3e-4  # thinnest part worth having, metres
-_BETWEEN = 3  # steps between two levels at which errors of a wall are tested
-_BUDGETS = np.geomspace(1e-3, 0.3, 36)  # sagittas of a sector to tabulate, shares of the largest radius
+_BETWEEN = 6  # steps between two levels at which errors of a wall are tested
+_BUDGETS = np.geomspace(1e-3, 0.3, 120)  # sagittas of a sector to tabulate, shares of the largest radius
 
 
 class _Stack(NamedTuple):
@@ -100,8 +101,7 @@ def _body(outer: _Stack, hollows: list[_Stack], low: float, high: float) -> Iter
     for below, above in zip(ends[:-1], ends[1:]):
         middle = (below + above) / 2
         around = [hollow for hollow in hollows if hollow.heights[0] < middle < hollow.heights[-1]]
-        inside = np.any((outer.heights > below) & (outer.heights < above))
-        levels = outer.heights[(outer.heights > below) & (outer.heights < above)] if inside else np.zeros(0)
+        levels = outer.heights[(outer.heights > below) & (outer.heights < above)]
         levels = np.concatenate([[below], levels, [above]])
         if around:
             found = _shell(outer, around[0], levels)
@@ -216,17 +216,22 @@ def _room(heights: np.ndarray, profiles: np.ndarray, sign: float, closed: tuple[
 
 
 def _profile_room(heights, radii, sign, closed) -> np.ndarray:
-    steps = np.linspace(0, 10 * _TOLERANCE, 81)
     line = np.stack([radii, heights], axis=1)
-    points = line[:, None] + np.stack([sign * steps, np.zeros_like(steps)], axis=1)
+    begin = line.copy()
     floor, ceiling = ([line[end] * [0, 1]] if flat else [] for end, flat in zip((0, -1), closed))
-    line = np.array([*floor, *line, *ceiling])
+    line = np.array([*floor, *line[_simplified(line, 1e-6)], *ceiling])
     along = np.diff(line, axis=0)
-    away = points[:, :, None] - line[:-1]
-    share = np.clip(np.sum(away * along, axis=3) / np.sum(along**2, axis=1), 0, 1)
-    distance = np.linalg.norm(away - share[..., None] * along, axis=3).min(axis=2)
-    within = np.logical_and.accumulate(distance <= 1.0001 * _TOLERANCE, axis=1)
-    return steps[within.sum(axis=1) - 1]
+    squares = np.sum(along**2, axis=1)
+    low, high = np.zeros(len(begin)), np.full(len(begin), 10 * _TOLERANCE)
+    for _ in range(9):
+        middle = (low + high) / 2
+        away_x, away_y = np.moveaxis(begin[:, None] - line[:-1], 2, 0)
+        away_x = away_x + sign * middle[:, None]
+        share = np.clip((away_x * along[:, 0] + away_y * along[:, 1]) / squares, 0, 1)
+        distance = (away_x - share * along[:, 0]) ** 2 + (away_y - share * along[:, 1]) ** 2
+        near = distance.min(axis=1) <= _TOLERANCE**2
+        low, high = np.where(near, middle, low), np.where(near, high, middle)
+    return np.maximum(low, _TOLERANCE)
 
 
 def _sagittas(polygon: np.ndarray) -> np.ndarray:
@@ -306,19 +311,17 @@ def _on_ring(polygon: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 def _shell(outer: _Stack, inner: _Stack, levels: np.ndarray) -> Iterator[np.ndarray]:
     """Sectors of the wall between an outline and a hollow, which has one outline of different sizes."""
-    # The hollow's frame has the same axes as the body's.
-    drop = inner.frame[2, 3] - outer.frame[2, 3]
-    within = inner.heights + drop
+    within = inner.heights  # a hollow's frame is that of its body
     levels = np.concatenate([levels, within[(within > levels[0]) & (within < levels[-1])]])
     levels = np.unique(np.round(levels, 9))
-    holes, bodies = inner.at(levels - drop), outer.at(levels)
+    holes, bodies = inner.at(levels), outer.at(levels)
     sizes = np.linalg.norm(holes, axis=2).max(axis=1)
     widest = int(np.argmax(np.linalg.norm(holes[0], axis=1)))
     walls = np.linalg.norm(bodies[:, widest], axis=1)
     keep = _simplified(np.column_stack([levels, sizes, walls]), _FINE)
     levels, holes, bodies, sizes, walls = levels[keep], holes[keep], bodies[keep], sizes[keep], walls[keep]
     dense = np.interp(np.arange(_BETWEEN * (len(levels) - 1) + 1) / _BETWEEN, np.arange(len(levels)), levels)
-    at_dense = inner.at(dense - drop), outer.at(dense)
+    at_dense = inner.at(dense), outer.at(dense)
     floor = (within[0] >= levels[0] - 1e-9, within[-1] <= levels[-1] + 1e-9)
     rooms = (_room(dense, _extremes(at_dense[0]), sign, floor) for sign in (1.0, -1.0))
     outer_rooms = (_room(dense, _extremes(at_dense[1]), sign) for sign in (-1.0, 1.0))
@@ -339,7 +342,10 @@ def _shell(outer: _Stack, inner: _Stack, levels: np.ndarray) -> Iterator[np.ndar
             )
             if plan is None:
                 if last - first == 1:
-                    raise InputError("convex_parts(): the object is too large for its tolerance; scale it down")
+                    raise InputError(
+                        f"convex_parts(): a hollow has a radius of {sizes.max():.3g} m; expected less than 0.9 m, for "
+                        "parts within 0.5 mm; scale the object to metres"
+                    )
                 if levels[last] - levels[first] > 0.001:
                     break
                 continue
@@ -505,7 +511,7 @@ def _chain(corners: np.ndarray) -> Iterator[np.ndarray]:
             longer = group[[0, middle, -1]].reshape(-1, 3)
             planes = _planes(longer)
             depth = np.max(group.reshape(-1, 3) @ planes[:, :3].T + planes[:, 3], axis=1)
-            if np.abs(depth).max() > _TOLERANCE:
+            if np.abs(depth).max() > _BEND:
                 break
             chosen, end = longer, end + 1
         yield chosen
@@ -527,9 +533,7 @@ def _outside(piece: np.ndarray, hollows: list[_Stack], body: _Stack) -> Iterator
     crossed = np.max(outside @ planes[:, :3].T + planes[:, 3], axis=1) < 2e-4
     outside, normals = outside[crossed], normals[crossed]
     if len(outside) == 0:
-        if np.any(np.max(piece[:, None, :2] ** 2, axis=-1) < 0) or not _in_hollow(piece.mean(axis=0), hollows):
-            yield piece
-        return
+        return  # all of it is within the body, or in the hollow
     few = np.linspace(0, len(outside) - 1, min(len(outside), 500)).astype(int)
     outside = outside[few] - 1.5e-4 * normals[few]  # parts of handle and body overlap by this
     candidates = normals[few[:: max(len(few) // 120, 1)]]
@@ -629,7 +633,13 @@ def _planes(points: np.ndarray) -> np.ndarray:
 
 
 def _hull_corners(points: np.ndarray) -> np.ndarray:
-    """Those of the points that are corners of their hull."""
+    """Those of the points that are corners of their hull; the nearest ones are merged while there are too many."""
     from scipy.spatial import ConvexHull
 
-    return points[np.sort(ConvexHull(points).vertices)]
+    grid = 2e-5
+    corners = points[np.sort(ConvexHull(points).vertices)]
+    while len(corners) > _CORNERS:
+        _, first = np.unique(np.round(corners / grid), axis=0, return_index=True)
+        corners = corners[np.sort(first)]
+        grid *= 1.5
+    return corners
