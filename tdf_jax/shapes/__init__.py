@@ -4,6 +4,7 @@ Modules:
     bottle: bottles
     bowl: bowls
     container: bins and shelves to stand bottles in
+    convex: convex parts of generated objects for physics engines
     mug: mugs
     rack: racks to hang mugs on
     shape: base class of generated objects
