@@ -272,8 +272,8 @@ def _window(model, data, camera: Camera, body: int) -> tuple[int, int, int, int]
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     corners = (centres[:, None] + radii[:, None, None] * signs).reshape(-1, 3)
     pixels = (corners / corners[:, 2:]) @ camera.intrinsics.T
-    low = np.floor(pixels.min(axis=0)).astype(int) - 1
-    high = np.ceil(pixels.max(axis=0)).astype(int) + 2
+    low = (np.floor(pixels.min(axis=0)).astype(int) - 1).tolist()
+    high = (np.ceil(pixels.max(axis=0)).astype(int) + 2).tolist()
     return max(low[1], 0), min(high[1], camera.height), max(low[0], 0), min(high[0], camera.width)
 
 

@@ -34,7 +34,7 @@ def convex_decomposition(
     tolerance: float = TOLERANCE,
     seed: int = 0,
     folder: str | Path | None = None,
-) -> list[Float[np.ndarray, "corners 3"]]:
+) -> list[Float[np.ndarray, "_ 3"]]:
     """Split a mesh into convex parts, whose union is about its material, by CoACD.
 
     The hollow and the finger hole of a scanned mug stay open. The first time takes up to minutes for a mesh; the parts
