@@ -206,8 +206,9 @@ def test_parts_of_a_hundred_objects_are_few_and_close_and_have_their_volume(cate
     for seed in range(100):
         shape, rng = sampled(seed, category), np.random.default_rng(seed)
         parts = assert_right(shape, rng, 500)
-        # The same points for both, so that the noise is that of the difference only.
-        assert abs(volume_ratio(shape, parts, rng) - 1) < 0.03, seed
+        # Flat faces fill a round wall by 0.1 mm on average, which is more than 3 % of a thin one.
+        thickness = shape.mesh.volume / shape.mesh.area
+        assert abs(volume_ratio(shape, parts, rng) - 1) < 0.03 + 1e-4 / thickness, seed
 
 
 @pytest.mark.slow
