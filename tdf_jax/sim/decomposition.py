@@ -11,6 +11,7 @@ from jaxtyping import Float
 from tdf_jax._internal import checks
 from tdf_jax._internal.cache import digest, kept
 from tdf_jax._internal.errors import InputError
+from tdf_jax.geometry.winding import inside, libigl
 from tdf_jax.sim.bodies import Body
 from tdf_jax.sim.physics import extra, object_mass
 
@@ -19,11 +20,11 @@ if TYPE_CHECKING:
 
 TOLERANCE = 0.0015  # metres
 SIZES = (0.005, 2.0)  # metres, longest edge of a mesh's box: others are in another unit
-SIMPLIFIED = 1e-4  # metres by which a closed mesh is simplified before: half the faces, and half the time
+SIMPLIFIED = 0.1  # of the tolerance, by which a mesh is simplified before: half the faces, and half the time
+STEP, MOST_CELLS = 0.6, 200  # of the tolerance, and along the longest edge: the grid on which open meshes are closed
 # Of the search for a cut, less than CoACD's defaults (150, 20 and 2000): half the time for a mug, equally good parts.
 SEARCH = {"mcts_iterations": 60, "mcts_nodes": 10, "resolution": 1000}
 MOST_PARTS = 200
-RESOLUTIONS = (50, 200)  # cells in half the longest edge of meshes that are not closed, which are made so
 LEAST_VOLUME = 1e-11  # m3 of a part, a hundredth of a cubic millimetre: thinner ones are no bodies
 VERSION = 1  # of what is in the cache
 
@@ -38,7 +39,8 @@ def convex_decomposition(
     """Split a mesh into convex parts, whose union is about its material, by CoACD.
 
     The hollow and the finger hole of a scanned mug stay open. The first time takes up to minutes for a mesh; the parts
-    are kept on disk. A mesh that is not closed is closed first, which thickens it by about half a tolerance.
+    are kept on disk. A mesh with small holes, or with faces turned either way, is closed first (libigl, the extra
+    "mesh"); walls thinner than a tolerance may be lost then.
 
     Args:
         mesh: mesh of a solid, metres.
@@ -52,8 +54,8 @@ def convex_decomposition(
         Corners of every part, (corners, 3), metres, in the mesh's frame; a part is their convex hull.
 
     Raises:
-        InputError: the mesh has no faces, is not finite or not in metres, has no volume, CoACD is not installed, or the
-            folder cannot be written.
+        InputError: the mesh has no faces, is not finite or not in metres, encloses no solid, CoACD (or, for a mesh
+            that is not closed, libigl) is not installed, or the folder cannot be written.
     """
     name = "convex_decomposition()"
     vertices, faces = _checked(name, mesh)
@@ -62,7 +64,7 @@ def convex_decomposition(
     coacd = extra(name, "coacd")
     about = [
         *("convex parts", VERSION, importlib.metadata.version("coacd"), digest(vertices, faces)),
-        *(float(tolerance), int(seed), SIMPLIFIED, SEARCH, MOST_PARTS, list(RESOLUTIONS)),
+        *(float(tolerance), int(seed), SIMPLIFIED, STEP, MOST_CELLS, SEARCH, MOST_PARTS),
     ]
 
     def compute():
@@ -149,18 +151,16 @@ def _folder(function: str, given: str | Path | None) -> Path:
 
 
 def _decomposed(coacd, mesh, vertices, faces, tolerance: float, seed: int) -> list[np.ndarray]:
-    mode = "on"  # it is made a closed surface
-    if _is_solid(mesh):
-        import manifold3d
+    import manifold3d
 
-        given = manifold3d.Mesh(vertices.astype(np.float32), faces.astype(np.uint32))
-        solid = manifold3d.Manifold(given)
-        if solid.status() == manifold3d.Error.NoError and not solid.is_empty():
-            simple = solid.simplify(SIMPLIFIED).to_mesh()
-            vertices = np.asarray(simple.vert_properties[:, :3], float)
-            faces = np.asarray(simple.tri_verts, np.int64)
-            mode = "off"
-    size = float(np.ptp(vertices[faces.ravel()], axis=0).max())
+    if not _is_solid(mesh):
+        vertices, faces = _closed("convex_decomposition()", mesh, vertices, faces, tolerance)
+    given = manifold3d.Mesh(vertices.astype(np.float32), faces.astype(np.uint32))
+    solid, mode = manifold3d.Manifold(given), "auto"  # which mends it if need be
+    if solid.status() == manifold3d.Error.NoError and not solid.is_empty():
+        simple = solid.simplify(SIMPLIFIED * tolerance).to_mesh()
+        vertices, faces = np.asarray(simple.vert_properties[:, :3], float), np.asarray(simple.tri_verts, np.int64)
+        mode = "off"
     coacd.set_log_level("error")
     found = coacd.run_coacd(
         coacd.Mesh(vertices, faces),
@@ -168,12 +168,40 @@ def _decomposed(coacd, mesh, vertices, faces, tolerance: float, seed: int) -> li
         real_metric=True,
         max_convex_hull=MOST_PARTS,
         preprocess_mode=mode,
-        preprocess_resolution=int(np.clip(np.ceil(size / tolerance), *RESOLUTIONS)),
         seed=int(seed),
         **SEARCH,
     )
     parts = [_hull(np.asarray(corners, float)) for corners, _ in found]
     return [part for part in parts if part is not None]
+
+
+def _closed(function: str, mesh, vertices, faces, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """The closed surface of what a mesh with small holes, or faces turned either way, encloses."""
+    from scipy.ndimage import binary_dilation, binary_erosion
+
+    igl = libigl(function)
+    low, high = (bound(vertices[faces.ravel()], axis=0) for bound in (np.min, np.max))
+    step = max(STEP * tolerance, float((high - low).max()) / MOST_CELLS)
+    nx, ny, nz = counts = (np.ceil((high - low) / step).astype(int) + 7).tolist()
+    # From an odd place: points on a face are neither inside nor outside.
+    z, y, x = np.meshgrid(*(low[i] + step * (np.arange(counts[i]) - 3.39) for i in (2, 1, 0)), indexing="ij")
+    grid = np.stack([x, y, z], axis=-1).reshape(-1, 3)  # x runs fastest
+    enclosed = inside(mesh, grid)
+    if enclosed is None or not enclosed.any():
+        raise InputError(
+            f"{function}: the mesh is open, and encloses no solid; expected the surface of a solid, with walls that "
+            "have two sides. Close it, or give a sheet a thickness"
+        )
+    solid = enclosed.reshape(nz, ny, nx)
+    near = (binary_dilation(solid, iterations=2) != binary_erosion(solid, iterations=2)).ravel()
+    distances = np.full(len(grid), 2 * step)
+    distances[near] = np.sqrt(igl.point_mesh_squared_distance(grid[near], vertices, faces)[0])
+    values = np.where(enclosed, distances, -distances)
+    vertices, faces, _ = igl.marching_cubes(values, grid, nx, ny, nz, 0.0)
+    vertices, faces = np.asarray(vertices, float), np.asarray(faces, np.int64)
+    corners = vertices[faces]
+    outwards = np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) > 0
+    return vertices, faces if outwards else faces[:, ::-1]
 
 
 def _hull(points: np.ndarray) -> np.ndarray | None:

@@ -6,6 +6,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from tdf_jax._internal.errors import InputError
+from tdf_jax.geometry.winding import inside
 from tdf_jax.shapes import FAMILIES
 from tdf_jax.sim import decomposition
 from tdf_jax.sim.decomposition import convex_decomposition, mesh_body
@@ -126,14 +127,24 @@ def test_a_mesh_that_is_not_closed_has_the_mass_properties_of_its_parts(cup, par
     np.testing.assert_allclose(body.inertia, whole.inertia, rtol=0.02, atol=2e-6)
 
 
-@pytest.mark.slow
-def test_a_mesh_that_is_not_closed_is_closed_first(cup, tmp_path, monkeypatch):
-    monkeypatch.setattr(decomposition, "SEARCH", FULL)
-    open_ = trimesh.Trimesh(cup.vertices, cup.faces[1:], process=False)
-    parts = convex_decomposition(open_, tolerance=COARSE, folder=tmp_path)
-    surface, _ = trimesh.sample.sample_surface(open_, 500, seed=0)
-    assert clearance(parts, np.asarray(surface)).max() < COARSE
-    assert clearance(parts, np.array([[0, 0, 0.03], [0, 0, 0.08]])).min() > BALL
+def test_a_mesh_with_its_faces_turned_inwards_is_closed_first(cup):
+    pytest.importorskip("igl", reason="the extra 'mesh' is not installed")
+    turned = trimesh.Trimesh(cup.vertices, cup.faces[:, ::-1], process=False)
+    vertices, faces = decomposition._closed("f()", turned, turned.vertices, turned.faces, COARSE)
+    closed = trimesh.Trimesh(vertices, faces, process=False)
+    assert closed.is_watertight and closed.is_winding_consistent
+    assert closed.volume == pytest.approx(cup.volume, rel=0.05)
+    np.testing.assert_allclose(closed.bounds, cup.bounds, atol=2e-4)
+    x, y, z = np.meshgrid([-0.02, 0, 0.02], [-0.02, 0, 0.02], [0.01, 0.04, 0.08])
+    points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    assert not inside(closed, points).any()
+
+
+def test_a_sheet_encloses_nothing_and_is_refused(cup, folder):
+    pytest.importorskip("igl", reason="the extra 'mesh' is not installed")
+    sheet = trimesh.Trimesh(cup.vertices, cup.faces[np.abs(cup.face_normals[:, 2]) < 0.5][:12], process=False)
+    with pytest.raises(InputError, match=r"convex_decomposition\(\): the mesh is open, and encloses no solid"):
+        convex_decomposition(sheet, folder=folder)
 
 
 @pytest.mark.slow
