@@ -34,6 +34,12 @@ class Collisions:
     def _kinds(self) -> np.ndarray:
         return geom_kinds(self.cell)
 
+    @functools.cached_property
+    def T_world_object(self) -> Float[np.ndarray, "4 4"] | None:
+        """Pose of the object where it starts, 4x4; None if there is none."""
+        names = [self.cell.model.body(number).name for number in range(self.cell.model.nbody)]
+        return self.cell.body_pose(self.cell.data(), OBJECT) if OBJECT in names else None
+
     def depths(
         self,
         joints: Float[np.ndarray, " joints"],

@@ -1,6 +1,7 @@
 """Motions of a robot along a trajectory: approach, grasp, path, release and retreat, as joints over time."""
 
 import dataclasses
+import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -21,10 +22,14 @@ from tdf_jax.sim.transit import connect
 APPROACH = 0.10  # metres along the approach before the pick, and back after the release
 SPACING, TURN = 0.005, 0.05  # metres and radians between poses for which the joints are computed
 MAX_STEP = 0.35  # radians, largest step of a joint between them; a larger one is another posture of the arm
-SEARCHES = 24  # starts of the search for postures at the pick
+SEARCHES = 40  # starts of the search for postures at the pick
 SAME = 0.05  # radians, postures nearer than this are one
 CLOSE_SECONDS, OPEN_SECONDS = 1.0, 0.6  # to close the fingers and to open them
+CARRYING = 0.4  # factor on the limits of velocity and acceleration with an object in the hand, which swings and slips
 RATE = 125.0  # samples per second
+DEPARTURE, ARRIVAL = 0.08, 0.12  # metres of the path that are followed even where the arm cannot follow its middle
+SHORTER = (1.0, 0.5)  # factors on approach, retreat and arrival that are tried
+MOST_POSTURES = 4  # postures tried at either end then
 # Penetrations that a plan may have, metres. Clouds and fields know surfaces to a millimetre or two.
 TOUCHING = 0.002
 RESTING = 0.006  # of the object and what it stands on or is placed on, near both ends
@@ -86,7 +91,8 @@ def plan_joints(
         cell: the cell to stay clear of; nothing by default.
         T_world_object: pose of the cell's object at the pick, 4x4; where it starts by default. The object is held from
             the pick on.
-        approach: length of the straight motions before the pick and after the release, metres.
+        approach: length of the straight motions before the pick and after the release, metres; half of it if there is
+            no such motion.
         seed: seed of the planner of the free motions, at least 1.
 
     Returns:
@@ -145,22 +151,16 @@ def plan_motion(
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     reasons: list[tuple[int, str]] = []
     for number, poses in enumerate(candidates):
-        for turned in (np.asarray(poses, float), np.asarray(poses, float) @ half_turn):
-            path = _Path(turned, approach)
-            for posture in _postures(kinematics, path.poses[path.pick]):
-                found = _followed(kinematics, path, posture)
-                if found is None:
-                    reasons.append((1, "the arm cannot follow the path within its limits"))
-                    continue
-                blocked = None if collisions is None else _blocked(collisions, path, found, opening, grip)
-                if blocked is not None:
-                    reasons.append((2, blocked))
-                    continue
-                transits = _transits(robot, collisions, path, found, opening, seed)
+        for half, share in itertools.product((np.eye(4), half_turn), SHORTER):
+            turned = np.asarray(poses, float) @ half
+            path = _Path(turned, share * approach)
+            ways = _ways(kinematics, collisions, path, opening, share * ARRIVAL, seed, reasons)
+            for there, carried, away in ways:
+                transits = _transits(robot, collisions, path, there[0], away[-1], opening, seed)
                 if transits is None:
                     reasons.append((3, f"no free motion from home and back (RRT-Connect, seed {seed})"))
                     continue
-                motion = _timed(robot, path, found, transits, opening, grip)
+                motion = _timed(robot, there, carried, away, transits, opening, grip)
                 return Plan(motion, turned[0], turned[-1], number, turned)
     if not reasons:
         return Failure("the pick has no posture of the arm within its limits: it is out of reach")
@@ -180,6 +180,18 @@ class _Path:
             at.append(at[-1] + len(rows[-1]))
         self.poses = np.concatenate(rows)
         self.pick, self.release = at[1], at[-2]
+        steps = np.linalg.norm(np.diff(self.poses[:, :3, 3], axis=0, prepend=self.poses[:1, :3, 3]), axis=1)
+        self.lengths = steps.cumsum()
+
+    def near_pick(self, distance: float) -> np.ndarray:
+        """Rows from the pick up to a distance along the path, metres."""
+        rows = np.arange(self.pick, self.release + 1)
+        return rows[self.lengths[rows] - self.lengths[self.pick] <= distance]
+
+    def near_release(self, distance: float) -> np.ndarray:
+        """Rows from a distance along the path, metres, up to the release."""
+        rows = np.arange(self.pick, self.release + 1)
+        return rows[self.lengths[self.release] - self.lengths[rows] <= distance]
 
 
 def _between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -217,92 +229,137 @@ def _near(robot: Robot, joints: np.ndarray) -> np.ndarray:
     return np.where((moved >= robot.lower) & (moved <= robot.upper), moved, joints)
 
 
-def _followed(kinematics: Kinematics, path: _Path, posture: np.ndarray) -> np.ndarray | None:
-    """Joints along a path from a posture at the pick, in both directions; None if the arm cannot follow."""
-    joints = np.empty((len(path.poses), len(posture)))
-    joints[path.pick] = posture
-    ways = (range(path.pick - 1, -1, -1), range(path.pick + 1, len(path.poses)))
-    for way in ways:
-        last = posture
+def _ways(kinematics: Kinematics, collisions, path: _Path, opening: float, arrival: float, seed: int, reasons) -> Iterator[tuple]:
+    """Joints to the pick, from there to the release, and away, for one posture of the arm after the other.
+
+    The arm follows the whole path, or else both ends of it, joined by a free motion with the object in the hand.
+    """
+    last = len(path.poses) - 1
+    leave, arrive = path.near_pick(DEPARTURE)[-1], path.near_release(arrival)[0]
+    picks, releases = [], []
+    for posture in _postures(kinematics, path.poses[path.pick]):
+        start = _followed(kinematics, path, posture, path.pick, 0, leave)
+        if start is None:
+            reasons.append((1, "the arm cannot follow the path within its limits"))
+            continue
+        blocked = _blocked(collisions, path, start, range(leave + 1), opening)
+        if blocked is not None:
+            reasons.append((2, blocked))
+            continue
+        picks.append(start)
+        whole = _followed(kinematics, path, start[leave], leave, leave, last)
+        if whole is None:
+            reasons.append((1, "the arm cannot follow the path within its limits"))
+            continue
+        blocked = _blocked(collisions, path, whole, range(leave + 1, last + 1), opening)
+        if blocked is None:
+            yield start[: path.pick + 1], _joined(start[path.pick : leave], whole[leave : path.release + 1]), whole[path.release :]
+        else:
+            reasons.append((2, blocked))
+    if not picks or collisions is None or arrive <= leave:
+        return
+    for posture in _postures(kinematics, path.poses[path.release]):
+        end = _followed(kinematics, path, posture, path.release, arrive, last)
+        if end is not None and _blocked(collisions, path, end, range(arrive, last + 1), opening) is None:
+            releases.append(end)
+            if len(releases) == MOST_POSTURES:
+                break
+    robot = kinematics.robot
+    free = _free(collisions, opening, kinematics, np.linalg.inv(path.poses[path.pick]) @ collisions.T_world_object)
+    for start in picks[:MOST_POSTURES]:
+        for end in releases:
+            middle = connect(start[leave], end[arrive], robot.lower, robot.upper, free, seed)
+            if middle is None:
+                reasons.append((2, f"no free motion with the object in the hand (RRT-Connect, seed {seed})"))
+                continue
+            carried = _joined(start[path.pick : leave], middle, end[arrive + 1 : path.release + 1])
+            yield start[: path.pick + 1], carried, end[path.release :]
+
+
+def _joined(*parts: np.ndarray) -> np.ndarray:
+    return np.concatenate([part for part in parts if len(part)])
+
+
+def _followed(
+    kinematics: Kinematics, path: _Path, posture: np.ndarray, at: int, first: int, last: int
+) -> np.ndarray | None:
+    """Joints along a path from `first` to `last`, from a posture at one of its poses; None if the arm cannot follow."""
+    joints = np.full((len(path.poses), len(posture)), np.nan)
+    joints[at] = posture
+    for way in (range(at - 1, first - 1, -1), range(at + 1, last + 1)):
+        before = posture
         for row in way:
-            solution = kinematics.solve(path.poses[row], last, FOLLOWING)
-            if solution is None or np.abs(solution - last).max() > MAX_STEP:
+            solution = kinematics.solve(path.poses[row], before, FOLLOWING)
+            if solution is None or np.abs(solution - before).max() > MAX_STEP:
                 return None
-            joints[row] = last = solution
+            joints[row] = before = solution
     return joints
 
 
-def _blocked(collisions: Collisions, path: _Path, joints, opening: float, grip: float) -> str | None:
-    """The first collision along a path, in words."""
-    data = collisions.cell.data()
-    T_object = collisions.cell.body_pose(data, "object") if collisions.cell.model.nbody and _has(collisions) else None
-    pick = path.poses[path.pick]
-    T_gripper_object = None if T_object is None else np.linalg.inv(pick) @ T_object
-    lengths = np.linalg.norm(np.diff(path.poses[:, :3, 3], axis=0, prepend=path.poses[:1, :3, 3]), axis=1).cumsum()
-    for row in range(len(joints)):
+def _blocked(collisions: Collisions | None, path: _Path, joints, rows, opening: float) -> str | None:
+    """The first collision at some rows of a path, in words."""
+    if collisions is None:
+        return None
+    T_object = collisions.T_world_object
+    T_gripper_object = None if T_object is None else np.linalg.inv(path.poses[path.pick]) @ T_object
+    near = {*path.near_pick(ENDS), *path.near_release(ENDS)}
+    for row in rows:
         held = path.pick < row <= path.release
-        placed = row > path.release
         T = T_object
-        if T_gripper_object is not None and (held or placed):
+        if T_gripper_object is not None and row > path.pick:
             T = path.poses[min(row, path.release)] @ T_gripper_object
-        depths = collisions.depths(joints[row], opening, T)
-        near_pick = lengths[row] - lengths[path.pick] < ENDS
-        near_release = lengths[path.release] - lengths[row] < ENDS
         where = "to the pick" if row <= path.pick else ("along the path" if held else "on the retreat")
-        for (a, b), depth in depths.items():
+        for (a, b), depth in collisions.depths(joints[row], opening, T).items():
             pair = {a, b}
-            if pair <= {"hand", "arm"} or pair == {"object", "hand"} and held:
+            if pair in ({"hand"}, {"target", "table"}):
                 continue
-            if pair == {"target", "table"} or pair == {"object"} or pair == {"arm"}:
+            if "object" in pair and "hand" in pair and held:
                 continue
             allowed = TOUCHING
-            if pair == {"object", "table"} and (near_pick or near_release or not held):
-                allowed = np.inf if not held else RESTING
-            elif pair == {"object", "target"} and (near_release or not held):
-                allowed = np.inf if not held else RESTING
+            if pair in ({"object", "table"}, {"object", "target"}):
+                allowed = np.inf if not held else (RESTING if row in near else TOUCHING)
             if depth > allowed:
                 return f"{a} and {b} collide {where} (by {1e3 * depth:.0f} mm)"
     return None
 
 
-def _has(collisions: Collisions) -> bool:
-    model = collisions.cell.model
-    return any(model.body(number).name == "object" for number in range(model.nbody))
+def _free(collisions: Collisions, opening: float, kinematics=None, T_gripper_object=None, T_world_object=None):
+    """Whether nothing collides at positions of the joints, with the object at a place or in the hand."""
+
+    def free(positions) -> bool:
+        T = T_world_object if T_gripper_object is None else kinematics.pose(positions) @ T_gripper_object
+        resting = () if T_gripper_object is not None else (("object", "table"), ("object", "target"))
+        holding = (("hand", "object"),) if T_gripper_object is not None else ()
+        passed = (*resting, *holding, ("hand", "hand"), ("target", "table"))
+        depths = collisions.depths(positions, opening, T)
+        return all(depth <= TOUCHING or pair in passed for pair, depth in depths.items())
+
+    return free
 
 
-def _transits(robot: Robot, collisions, path: _Path, joints, opening: float, seed: int):
+def _transits(robot: Robot, collisions: Collisions | None, path: _Path, first, last, opening: float, seed: int):
     """Free paths from home to the first pose and from the last pose home."""
     if collisions is None:
-        return np.stack([robot.home, joints[0]]), np.stack([joints[-1], robot.home])
-    cell = collisions.cell
-    T_start = cell.body_pose(cell.data(), "object") if _has(collisions) else None
+        return np.stack([robot.home, first]), np.stack([last, robot.home])
+    T_start = collisions.T_world_object
     T_end = None if T_start is None else path.poses[path.release] @ np.linalg.inv(path.poses[path.pick]) @ T_start
-
-    def free_with(T):
-        def free(positions):
-            depths = collisions.depths(positions, opening, T)
-            return all(
-                pair in (("object", "table"), ("object", "target"), ("target", "table"), ("object", "object"))
-                for pair in depths
-            )
-
-        return free
-
-    there = connect(robot.home, joints[0], robot.lower, robot.upper, free_with(T_start), seed)
-    back = connect(joints[-1], robot.home, robot.lower, robot.upper, free_with(T_end), seed)
-    return None if there is None or back is None else (there, back)
+    there = connect(robot.home, first, robot.lower, robot.upper, _free(collisions, opening, T_world_object=T_start), seed)
+    if there is None:
+        return None
+    back = connect(last, robot.home, robot.lower, robot.upper, _free(collisions, opening, T_world_object=T_end), seed)
+    return None if back is None else (there, back)
 
 
-def _timed(robot: Robot, path: _Path, joints, transits, opening: float, grip: float) -> JointTrajectory:
+def _timed(robot: Robot, to_pick, carried, away, transits, opening: float, grip: float) -> JointTrajectory:
     """The whole motion: every phase from rest to rest, with time for the fingers."""
     there, back = transits
     phases = (
         ("transit", there, opening),
-        ("approach", joints[: path.pick + 1], opening),
-        ("grasp", joints[path.pick][None], grip),
-        ("path", joints[path.pick : path.release + 1], grip),
-        ("release", joints[path.release][None], opening),
-        ("retreat", joints[path.release :], opening),
+        ("approach", to_pick, opening),
+        ("grasp", to_pick[-1:], grip),
+        ("path", carried, grip),
+        ("release", away[:1], opening),
+        ("retreat", away, opening),
         ("return", back, opening),
     )
     times, positions, gripper, segments = [], [], [], []
@@ -313,7 +370,8 @@ def _timed(robot: Robot, path: _Path, joints, transits, opening: float, grip: fl
             t = np.arange(int(seconds * RATE) + 1) / RATE
             q = np.repeat(waypoints, len(t), axis=0)
         else:
-            t, q = retime(waypoints, robot.max_velocity, robot.max_acceleration, RATE)
+            factor = CARRYING if name == "path" else 1.0
+            t, q = retime(waypoints, factor * robot.max_velocity, factor * robot.max_acceleration, RATE)
         segments.append((name, sum(len(part) for part in times)))
         keep = slice(0, None) if not times else slice(1, None)  # a phase begins where the one before ended
         times.append(now + t[keep])

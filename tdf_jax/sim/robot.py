@@ -19,7 +19,8 @@ from tdf_jax.sim.physics import TIMESTEP, compiled, extra, set_options
 
 PREFIX = "robot/"  # of the names of the robot's parts in a cell
 GRIPPER_PREFIX = "gripper/"
-HOME = (-1.5708, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)  # radians, the UR5e's in its file: the gripper points down
+# Radians: the gripper points down, 0.45 m above the table, where nothing stands. The home of the UR5e's file is lower.
+HOME = (-1.5708, -1.9623, 1.5698, -1.1782, -1.5708, 0.0)
 FORWARD = -np.pi / 2  # radians about z, by which the UR5e stands so that it faces +x
 MAX_VELOCITY = 1.2  # rad/s, of every joint; the UR5e's own limit is 3.14
 MAX_ACCELERATION = 3.0  # rad/s^2

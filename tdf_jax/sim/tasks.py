@@ -1,6 +1,7 @@
 """Tasks of simulated episodes: what is picked, where it goes, and where objects start, drawn before any method runs."""
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import jax
@@ -20,19 +21,25 @@ from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.geometry.target import Target
 from tdf_jax.shapes import FAMILIES, Shape
 from tdf_jax.sim.board import Board
+from tdf_jax.sim.bodies import Body, body_of
+from tdf_jax.sim.collision import Collisions
 from tdf_jax.sim.grasps import Grip, grip_of
 from tdf_jax.sim.kinematics import kinematics_of
 from tdf_jax.sim.robot import Robot
+from tdf_jax.sim.workcell import build_workcell
 
 POSES = ("upright", "tilt60", "uniform")
 OBJECTS = ((0.38, 0.56), (0.10, 0.32))  # metres, x and y on the table where objects start
-TARGETS = ((0.40, 0.56), (-0.32, -0.12))  # and targets
+TARGETS = ((0.54, 0.70), (-0.32, -0.10))  # and targets
 ABOVE = 0.12  # metres above the table of the lowest point of an object that a fixture holds
 NUM_POSES = 24
 APPROACH = 0.10  # metres along a peg, or down, at the end of a demonstrated path
 CLEARANCE = 0.06  # metres, height of a lift over the target's top
 GRIPPER_POINTS = 256
-MOST_DRAWS = 400
+STARTS, MOST_PAIRS = 25, 20  # starts that are drawn of a pair, and pairs that are drawn of an episode
+OTHER_PAIRS = 10_000_000  # between the numbers of the pairs of an episode
+BEHIND = 0.10  # metres behind the pick and the release, along the approach, which must be within reach too
+SAME_POSTURE = 1.5  # radians, largest movement of a joint on the way there
 SEARCHES = 12  # starts of the search for a posture of the arm at the true pick and at the true release
 
 
@@ -75,7 +82,7 @@ class Episode:
         T_target_contact: frame of the region where the two meet, 4x4.
         grip: the demonstrated grasp of this object.
         rejected: number of starts drawn before that the robot cannot reach.
-        redrawn: number of pairs drawn before that cannot fit.
+        redrawn: number of pairs drawn before that cannot fit, or of which no start is within reach.
     """
 
     task: str
@@ -90,6 +97,16 @@ class Episode:
     grip: Grip
     rejected: int
     redrawn: int
+
+    @functools.cached_property
+    def object_body(self) -> Body:
+        """The object's body for the physics."""
+        return body_of(self.object)
+
+    @functools.cached_property
+    def target_body(self) -> Body:
+        """The target's body."""
+        return body_of(self.target)
 
     @property
     def fixture(self) -> bool:
@@ -123,27 +140,74 @@ def draw_episode(task: str, robot: Robot, seed: int, number: int, poses: str = "
     """
     checks.choice("draw_episode()", "task", task, TASKS)
     checks.choice("draw_episode()", "poses", poses, POSES)
-    one, target, T_target_object, T_target_contact, redrawn = _pair(task, seed, number)
-    grip = grip_of(one, robot.fingers)
-    rng = np.random.default_rng([SEED_SPACE, seed, number, 7])
-    for rejected in range(MOST_DRAWS):
-        T_world_object, T_world_target = _start(one, poses, rng), _standing(target.mesh, TARGETS, rng)
-        made = Episode(
-            task, number, poses, one, target, T_world_object, T_world_target, T_target_object, T_target_contact, grip,
-            rejected, redrawn,
-        )  # fmt: skip
-        if within_reach(robot, [made.pick, made.release]):
-            return made
-    raise InputError(f"draw_episode(): no start of {task} {number} (seed {seed}) is within reach in {MOST_DRAWS} draws")
+    rejected = redrawn = 0
+    for other in range(MOST_PAIRS):
+        drawn = _pair(task, seed, number + other * OTHER_PAIRS)
+        one, target, T_target_object, T_target_contact, unfit = drawn
+        redrawn += unfit
+        rng = np.random.default_rng([SEED_SPACE, seed, number + other * OTHER_PAIRS, 7])
+        grip = grip_of(one, robot.fingers)
+        bodies = {"object_body": body_of(one), "target_body": body_of(target)}
+        # One cell, in which the bodies are moved from start to start.
+        cell = build_workcell(robot, bodies["object_body"], None, bodies["target_body"], None, fixed_target=False)
+        collisions = Collisions(cell)
+        for _ in range(STARTS):
+            made = Episode(
+                task=task,
+                number=number,
+                poses=poses,
+                object=one,
+                target=target,
+                T_world_object=_start(one, poses, rng),
+                T_world_target=_standing(target.mesh, TARGETS, rng),
+                T_target_object=T_target_object,
+                T_target_contact=T_target_contact,
+                grip=grip,
+                rejected=rejected,
+                redrawn=redrawn,
+            )
+            made.__dict__.update(bodies)
+            if within_reach(made, robot, collisions):
+                return made
+            rejected += 1
+        redrawn += 1
+    raise InputError(
+        f"draw_episode(): no {task} of episode {number} (seed {seed}) is within reach of {robot.name} in {MOST_PAIRS} "
+        f"pairs of {STARTS} starts each; expected a robot that reaches the table"
+    )
 
 
-def within_reach(robot: Robot, poses) -> bool:
-    """Whether the arm has a posture at every pose of the gripper's frame, as it is or turned by half a turn."""
+def within_reach(episode: Episode, robot: Robot, collisions: Collisions) -> bool:
+    """Whether the arm has postures at the true pick and the true release, and behind them, in which nothing collides.
+
+    Args:
+        episode: the episode.
+        robot: the robot.
+        collisions: of a cell with the episode's bodies, the target free.
+    """
     kinematics, rng = kinematics_of(robot), np.random.default_rng(0)
-    for T in poses:
-        turned = T @ np.diag([-1.0, -1.0, 1.0, 1.0])
-        starts = [robot.home] + [robot.home + rng.uniform(-2, 2, robot.num_joints) for _ in range(SEARCHES)]
-        if not any(kinematics.solve(one, start) is not None for start in starts for one in (T, turned)):
+    behind = np.eye(4)
+    behind[2, 3] = -BEHIND
+    placed = episode.T_world_target @ episode.T_target_object
+
+    def free(joints, T_object, meet) -> bool:
+        depths = collisions.depths(joints, episode.grip.opening, T_object, episode.T_world_target)
+        return all(set(pair) in (meet, {"target", "table"}, {"hand"}) for pair in depths)
+
+    for T, T_object, meet in (
+        (episode.pick, episode.T_world_object, {"object", "table"}),
+        (episode.release, placed, {"object", "target"}),
+    ):
+        starts = [robot.home] + [robot.home + rng.uniform(-2.5, 2.5, robot.num_joints) for _ in range(SEARCHES)]
+        for start, half_turn in ((start, half_turn) for start in starts for half_turn in (1.0, -1.0)):
+            pose = T @ np.diag([half_turn, half_turn, 1.0, 1.0])
+            joints = kinematics.solve(pose, np.clip(start, robot.lower, robot.upper))
+            if joints is None or not free(joints, T_object, meet):
+                continue
+            away = kinematics.solve(pose @ behind, joints)
+            if away is not None and np.abs(away - joints).max() < SAME_POSTURE and free(away, T_object, meet):
+                break
+        else:
             return False
     return True
 
