@@ -33,6 +33,7 @@ COMMANDS = (
     "dataset",
     "train",
     "reproduce",
+    "simulate",
 )
 # Options of the release before by command; they are accepted for one release, with a warning.
 DEPRECATED_FLAGS = {

@@ -28,7 +28,7 @@ class Body:
         mesh: its surface, for pictures, clouds and tests.
     """
 
-    parts: list[Float[np.ndarray, "corners 3"]]
+    parts: list[Float[np.ndarray, "_ 3"]]
     mass: float
     centre: Float[np.ndarray, "3"]
     inertia: Float[np.ndarray, "3 3"]

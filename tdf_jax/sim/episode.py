@@ -24,7 +24,7 @@ SETTLE = 2.0  # seconds after the release, as in NDF and R-NDF
 MOVING = 0.25  # m/s, faster than a mug that swings on its peg, which nothing damps but friction
 UPSIDE_DOWN = 1.0  # seconds with gravity reversed
 FALLS = 0.03  # metres that an object moves from its target then, unless it is stuck in it
-LOST = 0.05  # metres, an object that moved farther in the hand is not in it any more
+LOST = 0.1  # seconds without contact after which the object is not in the hand any more
 WATCHED = 5  # steps of the physics between looks
 # Errors of a pick, metres and degrees, from which it is the pick that failed.
 WRONG_PICK = (0.03, 30.0)
@@ -161,6 +161,7 @@ class _Observer:
         self.cell, self.watch = cell, watch
         self.kinds = geom_kinds(cell)
         self.collided, self.struck, self.lost, self.held = "", "", "", True
+        self.without = 0
         self.closed: np.ndarray | None = None
         self.last: np.ndarray | None = None
 
@@ -186,7 +187,8 @@ class _Observer:
             self.struck = f"the gripper touches the target ({phase})"
         if phase == "path":
             self.last = self._in_hand(data)
-            if self.held and self.moved_in_hand()[0] > LOST:
+            self.without = 0 if (HAND_KIND, OBJECT_KIND) in pairs else self.without + 1
+            if self.held and self.without * WATCHED * TIMESTEP > LOST:
                 self.held, self.lost = False, f"out of the hand after {data.time:.1f} s"
         if self.watch is not None:
             self.watch(self.cell, data, phase)

@@ -10,10 +10,11 @@ from tdf_jax.shapes import Shape
 from tdf_jax.sim.robot import Fingers
 
 CLEARANCE = 0.018  # metres between each finger and the wall before closing
-NECK_CLEARANCE = 0.012  # of a neck, whose middle the cloud shows well
+NECK_CLEARANCE = 0.010  # of a neck, whose middle the cloud shows well
 RIM_DEPTH = 0.030  # metres from the rim down the wall to the tips of the fingers
 MOST_DEPTH = 0.6  # of the height of a low bowl
-NECK_DEPTH = 0.028  # metres from a bottle's top to the tips
+NECK_DEPTHS = (0.022, 0.070)  # metres from a bottle's top to the tips
+LEVEL, STEP = 0.0015, 0.002  # metres: pads touch where the width is the largest between them, up to `LEVEL`
 TIPS = 0.0187  # metres from the middle of the pads to their tips
 # Where a wall's middle is measured below the rim, metres: the gripper lies along the line through both.
 WALL_LEVELS = (0.004, 0.025)
@@ -84,17 +85,30 @@ def _wall(shape: Shape, rim, level: float) -> tuple[np.ndarray, float]:
 
 
 def _neck_grip(shape: Shape, fingers: Fingers) -> Grip:
-    """From above, closing along the y axis; the axis of a round bottle leaves the turn about it free."""
+    """From above, closing along the y axis; the axis of a round bottle leaves the turn about it free.
+
+    The tips are where the pads touch along the greatest length: a bottle that is held at one point swings.
+    """
     top = float(shape.mesh.bounds[1, 2])
-    levels = top - np.linspace(0.004, NECK_DEPTH, 9)
-    y = np.linspace(0, 0.06, 601)
-    half = 0.0
-    for level in levels:
-        line = np.stack([np.zeros_like(y), y, np.full_like(y, level)], axis=1)
-        inside = np.flatnonzero(shape.contains(line))
-        if len(inside):
-            half = max(half, float(y[inside[-1]]))
-    width = 2 * half
+    below = np.arange(0.001, NECK_DEPTHS[1], STEP)
+    widths = np.array([_width(shape, top - level) for level in below])
+    widest = fingers.widest - 2 * NECK_CLEARANCE
+    depths = [depth for depth in np.arange(*NECK_DEPTHS, STEP) if widths[below <= depth].max() <= widest]
+    lengths = []
+    for depth in depths:
+        between = widths[(below <= depth) & (below > depth - 2 * TIPS)]
+        lengths.append(int((between > between.max() - LEVEL).sum()))
+    if not depths:
+        raise InputError(f"grip_of(): the neck of the bottle is wider than the gripper, {1e3 * fingers.widest:.0f} mm")
+    depth = depths[int(np.argmax(lengths))]
+    width = float(widths[(below <= depth) & (below > depth - 2 * TIPS)].max())
     T = np.diag([-1.0, 1.0, -1.0, 1.0])
-    T[2, 3] = top - (NECK_DEPTH - TIPS - fingers.depth(width))
-    return Grip(T, width, min(width + 2 * NECK_CLEARANCE, fingers.widest))
+    T[2, 3] = top - (depth - TIPS - fingers.depth(width))
+    return Grip(T, width, min(float(widths[below <= depth].max()) + 2 * NECK_CLEARANCE, fingers.widest))
+
+
+def _width(shape: Shape, level: float) -> float:
+    """Width of an object along y at a height, metres."""
+    y = np.linspace(0, 0.06, 301)
+    inside = np.flatnonzero(shape.contains(np.stack([np.zeros_like(y), y, np.full_like(y, level)], axis=1)))
+    return 2 * float(y[inside[-1]]) if len(inside) else 0.0

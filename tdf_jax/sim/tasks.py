@@ -19,6 +19,7 @@ from tdf_jax.geometry.paths import hang_on_rack, lift_over
 from tdf_jax.geometry.query import box_query, gripper_query
 from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.geometry.target import Target
+from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.shapes import FAMILIES, Shape
 from tdf_jax.sim.board import Board
 from tdf_jax.sim.bodies import Body, body_of
@@ -34,6 +35,7 @@ TARGETS = ((0.54, 0.70), (-0.32, -0.10))  # and targets
 ABOVE = 0.12  # metres above the table of the lowest point of an object that a fixture holds
 NUM_POSES = 24
 APPROACH = 0.10  # metres along a peg, or down, at the end of a demonstrated path
+RAISED = 0.008  # metres above the peg of that motion, at most half of what the finger hole leaves
 CLEARANCE = 0.06  # metres, height of a lift over the target's top
 GRIPPER_POINTS = 256
 STARTS, MOST_PAIRS = 25, 20  # starts that are drawn of a pair, and pairs that are drawn of an episode
@@ -124,7 +126,9 @@ class Episode:
         return self.T_world_target @ self.T_target_object @ self.grip.T_object_grip
 
 
-def draw_episode(task: str, robot: Robot, seed: int, number: int, poses: str = "upright") -> Episode:
+def draw_episode(
+    task: str, robot: Robot, seed: int, number: int, poses: str = "upright", known: Episode | None = None
+) -> Episode:
     """Draw an episode: the pair, and a start from which the true pick and the true release are within reach.
 
     Args:
@@ -134,6 +138,7 @@ def draw_episode(task: str, robot: Robot, seed: int, number: int, poses: str = "
         number: number of the episode.
         poses: "upright" on the table with any yaw; "tilt60" with roll and pitch within 60 degrees too, or "uniform",
             both held by a fixture above the table.
+        known: the demonstrated episode, if its target is to stand where it stood; otherwise another target is drawn.
 
     Raises:
         InputError: there is no such task or poses, or nothing within reach is drawn.
@@ -142,7 +147,10 @@ def draw_episode(task: str, robot: Robot, seed: int, number: int, poses: str = "
     checks.choice("draw_episode()", "poses", poses, POSES)
     rejected = redrawn = 0
     for other in range(MOST_PAIRS):
-        drawn = _pair(task, seed, number + other * OTHER_PAIRS)
+        drawn = _pair(task, seed, number + other * OTHER_PAIRS, None if known is None else known.target)
+        if drawn is None:
+            redrawn += 1
+            continue
         one, target, T_target_object, T_target_contact, unfit = drawn
         redrawn += unfit
         rng = np.random.default_rng([SEED_SPACE, seed, number + other * OTHER_PAIRS, 7])
@@ -159,7 +167,7 @@ def draw_episode(task: str, robot: Robot, seed: int, number: int, poses: str = "
                 object=one,
                 target=target,
                 T_world_object=_start(one, poses, rng),
-                T_world_target=_standing(target.mesh, TARGETS, rng),
+                T_world_target=_standing(target.mesh, TARGETS, rng) if known is None else known.T_world_target,
                 T_target_object=T_target_object,
                 T_target_contact=T_target_contact,
                 grip=grip,
@@ -225,8 +233,15 @@ def demonstrate_episode(episode: Episode, seed: int, points: int = 1500) -> Demo
     ends = {"rotation": pick[:3, :3], "end_rotation": release[:3, :3]}
     T_world_contact = episode.T_world_target @ episode.T_target_contact
     if episode.task == "mug_on_rack":
+        # Along the peg a little above it, then down onto it: an arm is a millimetre or two too low with a mug in hand.
+        hole, peg = episode.object.finger_hole, episode.target.parameters.peg_thickness
+        free = float(np.ptp(hole[:, 0])) - episode.object.parameters.handle_thickness - peg
+        raised = release[:3, 3] + min(RAISED, 0.5 * max(free, 0.0)) * T_world_contact[:3, 2]
         along = -APPROACH * T_world_contact[:3, 0]
-        path = hang_on_rack(NUM_POSES, pick[:3, 3], release[:3, 3], approach=along, **ends)
+        onto = np.asarray(hang_on_rack(NUM_POSES - 2, pick[:3, 3], raised, approach=along, **ends).wxyz_xyz)
+        down = onto[-1:].repeat(2, axis=0)
+        down[:, 4:] = np.stack([(raised + release[:3, 3]) / 2, release[:3, 3]])
+        path = Trajectory(np.concatenate([onto, down]))
     else:
         height = float(episode.target.mesh.extents[2]) + CLEARANCE
         path = lift_over(NUM_POSES, pick[:3, 3], release[:3, 3], height=height, **ends)
@@ -243,12 +258,17 @@ def demonstrate_episode(episode: Episode, seed: int, points: int = 1500) -> Demo
     )
 
 
-def _pair(task: str, seed: int, number: int):
-    if task in RELATIONS:
+def _pair(task: str, seed: int, number: int, target: Shape | Board | None):
+    """An object, a target, the seated pose, the contact frame, and how many pairs did not fit; None if these do not."""
+    if task in RELATIONS and target is None:
         pair = draw_pair(task, seed, number)
         return pair.object, pair.target, pair.T_target_object, pair.T_target_contact, pair.redrawn
     family = FAMILIES[TASKS[task].object]
     one = family.build(family.sample(np.random.default_rng([SEED_SPACE, seed, number, 3])))
+    if task in RELATIONS:
+        assert isinstance(target, Shape)
+        seated = RELATIONS[task].seat(one, target)
+        return None if seated is None else (one, target, *seated, 0)
     board = Board()
     top = np.eye(4)
     top[2, 3] = board.mesh.bounds[1, 2]

