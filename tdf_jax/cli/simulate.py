@@ -20,7 +20,7 @@ def simulate(
     demonstrations: int = 1,
     seed: int = 0,
     clouds: Literal["full", "views3", "views1"] = "full",
-    method: Literal["tdf_jax", "truth", "rigid replay", "ICP"] = "tdf_jax",
+    method: Literal["tdf_jax", "uncentred", "truth", "rigid replay", "ICP"] = "tdf_jax",
     light: bool = False,
     object_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
     target_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
@@ -45,7 +45,7 @@ def simulate(
         demonstrations: 1, each that of a tenth of the episodes, or 10.
         seed: seed of objects, starts and searches.
         clouds: complete clouds, or what three depth cameras or one see.
-        method: tdf_jax, the truth, or a baseline: the demonstrated path moved with the clouds' centroids, or by ICP.
+        method: tdf_jax; uncentred, without centring the grasp on the cloud; the truth; or a baseline: the demonstrated path moved with the clouds' centroids, or by ICP.
         light: objects of 0.01 kg, as in NDF and R-NDF, instead of 0.10 to 0.40 kg by volume.
         object_weights: weights of the object.
         target_weights: weights of the target.
@@ -77,7 +77,7 @@ def simulate(
     check_condition(condition)
     if target_weights is None:
         target_weights = _shipped(TASKS[task].target)
-    if target == "found" and target_weights is None and method == "tdf_jax":
+    if target == "found" and target_weights is None and method in ("tdf_jax", "uncentred"):
         raise InputError(
             f"tdf simulate: there are no shipped weights of a {TASKS[task].target}; expected --target known, or "
             "--target-weights FILE of a network from tdf train"

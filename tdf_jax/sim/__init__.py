@@ -3,6 +3,24 @@
 Modules:
     physics: settings of the physics in one place, and the import of the engine
     robot: an arm and a gripper, from a package or from a file
+    board: a board at a height, the shelf of the tasks
+    bodies: rigid bodies of generated objects
+    decomposition: convex parts of users' meshes, and the bodies that they make
+    workcell: the table, an arm or a floating gripper, the object and the target
+    cameras: depth cameras around a cell, and clouds of what they see
+    kinematics: inverse kinematics of an arm, at a pose and along a path
+    collision: what touches what at planned positions
+    transit: free motions from one posture to another
     joint_trajectory: a timed motion of the joints, and its files
     retiming: times of a path of the joints within limits of velocity and acceleration
+    motion: motions of a robot along a trajectory, from home to home
+    execution: a joint trajectory in physics
+    grasps: grasps of generated objects that a demonstration shows
+    grasping: whether a grasp holds an object that is lifted and turned
+    centring: a grasp in the middle of what is between the fingers
+    tasks: what is picked, where it goes, and where objects start
+    episode: one task from the start to the settled end
+    campaign: many episodes in several processes
+    report: success, causes of failure, and the record of a run
+    recording: pictures and films of a cell
 """

@@ -10,9 +10,10 @@ import time
 from collections.abc import Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 from tqdm import tqdm
 
 from tdf_jax._internal import checks
@@ -22,13 +23,16 @@ from tdf_jax.sim.episode import MODES, Outcome
 from tdf_jax.sim.tasks import POSES, TASKS
 from tdf_jax.training import workers
 
-FORMAT = 1  # format number; raise it when what an episode computes changes
+if TYPE_CHECKING:
+    from tdf_jax.sim.robot import Robot
+
+FORMAT = 2  # format number; raise it when what an episode computes changes
 DEMONSTRATIONS = 10  # episodes that demonstrate; with one demonstration, each is that of a tenth of the episodes
 FIRST_DEMONSTRATION = 1_000_000  # their numbers begin here, so that no episode shares their objects
 CLOUDS = ("full", "views3", "views1")
 TARGETS = ("known", "found")
-LIBRARY, TRUTH, REPLAY, ICP = "tdf_jax", "truth", "rigid replay", "ICP"
-METHODS = (LIBRARY, TRUTH, REPLAY, ICP)
+LIBRARY, UNCENTRED, TRUTH, REPLAY, ICP = "tdf_jax", "uncentred", "truth", "rigid replay", "ICP"
+METHODS = (LIBRARY, UNCENTRED, TRUTH, REPLAY, ICP)
 ICP_STARTS = 10
 POINTS = 1500  # of a complete cloud
 VIEWED = 4000  # most points of a cloud of cameras: the field takes a subsample
@@ -139,7 +143,12 @@ def run_campaign(
     """
     check_condition(settings.condition)
     count = min(episodes, processes or len(os.sched_getaffinity(0)))
-    bar = tqdm(total=episodes, desc=f"{settings.condition.task}, {settings.condition.mode}", unit="episode", disable=not progress)
+    bar = tqdm(
+        total=episodes,
+        desc=f"{settings.condition.task}, {settings.condition.mode}",
+        unit="episode",
+        disable=not progress,
+    )
     with _pool(count) as pool:
         pending = [pool.submit(run_one, settings, number) for number in range(episodes)]
         try:
@@ -218,6 +227,22 @@ def film(settings: Settings, number: int, path: Path) -> Outcome:
         for one in recorder:
             one.close()
     return outcome
+
+
+def centred_path(
+    path: Float[np.ndarray, "poses 4 4"], points: Float[np.ndarray, "points 3"], opening: float, robot: "Robot"
+) -> Float[np.ndarray, "poses 4 4"]:
+    """A path whose pick is centred on the cloud; see `tdf_jax.sim.centring`. The object moves as before.
+
+    Args:
+        path: poses of the gripper's frame from the pick to the release, (poses, 4, 4).
+        points: cloud of the object at the pick, (points, 3), metres, world frame.
+        opening: opening of the fingers before they close, metres.
+        robot: the robot.
+    """
+    from tdf_jax.sim.centring import centred
+
+    return path @ (np.linalg.inv(path[0]) @ centred(path[0], points, opening, robot.fingers))
 
 
 @functools.lru_cache(maxsize=1)
@@ -312,8 +337,11 @@ class _Bench:
             path = demonstrate_episode(episode, self.settings.seed).trajectory
             return [np.asarray(path.matrices, float)], true
         points, target_points = self.clouds(episode)
-        found = self.library if condition.method == LIBRARY else self.baseline
-        return found(episode.number, points, None if condition.target == "known" else target_points, shown)
+        found = self.library if condition.method in (LIBRARY, UNCENTRED) else self.baseline
+        paths, motion = found(episode.number, points, None if condition.target == "known" else target_points, shown)
+        if condition.method != UNCENTRED:
+            paths = [centred_path(path, points, episode.grip.opening, self.robot) for path in paths]
+        return paths, motion
 
     def clouds(self, episode) -> tuple[np.ndarray, np.ndarray]:
         """Clouds of object and target, (points, 3) each, metres, world frame."""

@@ -102,7 +102,9 @@ def teleport(
         cause = "pick wrong" if wrong else "slipped"
         detail = wrong or f"{1e3 * grasp.slip:.0f} mm and {grasp.turn:.0f} degrees in the hand"
     overall = grasp.held and placed
-    return Outcome(grasp.held, placed, overall, overall and hung, "" if overall and hung else cause, detail, grasp.slip, grasp.turn)
+    return Outcome(
+        grasp.held, placed, overall, overall and hung, "" if overall and hung else cause, detail, grasp.slip, grasp.turn
+    )
 
 
 def run_episode(
@@ -145,7 +147,11 @@ def run_episode(
         placed, cause, detail = False, "collided", observer.collided
     elif not placed or not hung:
         if not observer.held:
-            cause, detail = ("pick wrong", _pick_error(episode, plan.pick)) if _pick_error(episode, plan.pick) else ("lost in transit", observer.lost)
+            cause, detail = (
+                ("pick wrong", _pick_error(episode, plan.pick))
+                if _pick_error(episode, plan.pick)
+                else ("lost in transit", observer.lost)
+            )
         elif slip > MOST_SLIP or turn > MOST_TURN:
             cause, detail = "slipped", f"{1e3 * slip:.0f} mm and {turn:.0f} degrees in the hand; {detail}"
         elif observer.struck:

@@ -166,4 +166,3 @@ class FloatingHand:
 
 def _point(x) -> np.ndarray:
     return np.append(np.asarray(x, float), 1.0)
-

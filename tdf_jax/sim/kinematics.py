@@ -39,7 +39,9 @@ class Kinematics:
         set_options(spec)
         yaw = self.robot.yaw
         spec.attach(
-            self.robot.spec(), prefix=PREFIX, frame=spec.worldbody.add_frame(quat=(np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)))
+            self.robot.spec(),
+            prefix=PREFIX,
+            frame=spec.worldbody.add_frame(quat=(np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))),
         )
         # The fingers' joints would only make every step slower.
         fixed = [one for one in spec.joints if one.name.removeprefix(PREFIX) not in self.robot.joints]
@@ -51,7 +53,9 @@ class Kinematics:
     def _tools(self) -> Any:
         mink = extra("Kinematics", "mink")
         configuration = mink.Configuration(self._model)
-        task = mink.FrameTask(PREFIX + self.robot.site, "site", position_cost=1.0, orientation_cost=1.0, lm_damping=1e-6)
+        task = mink.FrameTask(
+            PREFIX + self.robot.site, "site", position_cost=1.0, orientation_cost=1.0, lm_damping=1e-6
+        )
         limits = [mink.ConfigurationLimit(self._model)]
         arm = [int(self._model.joint(PREFIX + name).qposadr[0]) for name in self.robot.joints]
         return mink, configuration, task, limits, arm

@@ -229,7 +229,9 @@ def _near(robot: Robot, joints: np.ndarray) -> np.ndarray:
     return np.where((moved >= robot.lower) & (moved <= robot.upper), moved, joints)
 
 
-def _ways(kinematics: Kinematics, collisions, path: _Path, opening: float, arrival: float, seed: int, reasons) -> Iterator[tuple]:
+def _ways(
+    kinematics: Kinematics, collisions, path: _Path, opening: float, arrival: float, seed: int, reasons
+) -> Iterator[tuple]:
     """Joints to the pick, from there to the release, and away, for one posture of the arm after the other.
 
     The arm follows the whole path, or else both ends of it, joined by a free motion with the object in the hand.
@@ -253,7 +255,11 @@ def _ways(kinematics: Kinematics, collisions, path: _Path, opening: float, arriv
             continue
         blocked = _blocked(collisions, path, whole, range(leave + 1, last + 1), opening)
         if blocked is None:
-            yield start[: path.pick + 1], _joined(start[path.pick : leave], whole[leave : path.release + 1]), whole[path.release :]
+            yield (
+                start[: path.pick + 1],
+                _joined(start[path.pick : leave], whole[leave : path.release + 1]),
+                whole[path.release :],
+            )
         else:
             reasons.append((2, blocked))
     if not picks or collisions is None or arrive <= leave:
@@ -343,7 +349,9 @@ def _transits(robot: Robot, collisions: Collisions | None, path: _Path, first, l
         return np.stack([robot.home, first]), np.stack([last, robot.home])
     T_start = collisions.T_world_object
     T_end = None if T_start is None else path.poses[path.release] @ np.linalg.inv(path.poses[path.pick]) @ T_start
-    there = connect(robot.home, first, robot.lower, robot.upper, _free(collisions, opening, T_world_object=T_start), seed)
+    there = connect(
+        robot.home, first, robot.lower, robot.upper, _free(collisions, opening, T_world_object=T_start), seed
+    )
     if there is None:
         return None
     back = connect(last, robot.home, robot.lower, robot.upper, _free(collisions, opening, T_world_object=T_end), seed)

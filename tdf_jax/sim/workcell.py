@@ -157,7 +157,10 @@ def build_workcell(
         top = spec.worldbody.add_geom(name=TABLE_NAME, type=box, pos=centre, size=half, rgba=COLOURS["table"])
         _set_contact(top)
     spec.worldbody.add_light(pos=(0.3, -0.5, 2.0), dir=(0.1, 0.2, -1.0))
-    for name, body, pose, free in ((OBJECT, one, T_world_object, True), (TARGET, target, T_world_target, not fixed_target)):
+    for name, body, pose, free in (
+        (OBJECT, one, T_world_object, True),
+        (TARGET, target, T_world_target, not fixed_target),
+    ):
         if body is not None:
             _add_body(mujoco, spec, name, body, np.eye(4) if pose is None else pose, free)
     if fixture:
@@ -180,7 +183,9 @@ def _add_body(mujoco, spec, name: str, body: Body, T, free: bool) -> None:
         made.inertia, made.iquat = values, Rotation.from_matrix(axes).as_quat(scalar_first=True)
     for number, corners in enumerate(body.parts):
         mesh = f"{name}{number}"
-        spec.add_mesh(name=mesh, uservert=np.asarray(corners, float).ravel(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
+        spec.add_mesh(
+            name=mesh, uservert=np.asarray(corners, float).ravel(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+        )
         geom = made.add_geom(name=mesh, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh, rgba=COLOURS[name], mass=0.0)
         _set_contact(geom)
 
