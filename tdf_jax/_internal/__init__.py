@@ -10,4 +10,5 @@ Modules:
     files: atomic writes
     precision: full float32 products on every device
     units: units of length
+    workers: processes that end with the run
 """

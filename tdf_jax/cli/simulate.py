@@ -45,7 +45,8 @@ def simulate(
         demonstrations: 1, each that of a tenth of the episodes, or 10.
         seed: seed of objects, starts and searches.
         clouds: complete clouds, or what three depth cameras or one see.
-        method: tdf_jax; uncentred, without centring the grasp on the cloud; the truth; or a baseline: the demonstrated path moved with the clouds' centroids, or by ICP.
+        method: tdf_jax; uncentred, without centring the grasp on the cloud; the truth; or a baseline: the demonstrated
+            path moved with the clouds' centroids, or by ICP.
         light: objects of 0.01 kg, as in NDF and R-NDF, instead of 0.10 to 0.40 kg by volume.
         object_weights: weights of the object.
         target_weights: weights of the target.

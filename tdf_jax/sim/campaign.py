@@ -16,12 +16,11 @@ import numpy as np
 from jaxtyping import Float
 from tqdm import tqdm
 
-from tdf_jax._internal import checks
+from tdf_jax._internal import checks, workers
 from tdf_jax._internal.cache import kept
 from tdf_jax._internal.errors import InputError
 from tdf_jax.sim.episode import MODES, Outcome
 from tdf_jax.sim.tasks import POSES, TASKS
-from tdf_jax.training import workers
 
 if TYPE_CHECKING:
     from tdf_jax.sim.robot import Robot
@@ -373,6 +372,7 @@ class _Bench:
     def library(self, number: int, points, target_points, shown: int):
         """What `tdf_jax.imitate` finds."""
         import jax
+        import jax.numpy as jnp
 
         from tdf_jax.geometry.trajectory import Trajectory
         from tdf_jax.imitation import imitate
@@ -387,7 +387,7 @@ class _Bench:
         )
         finite = np.asarray(result.finite)
         order = [row for row in np.argsort(np.asarray(result.energies), kind="stable") if finite[row]]
-        paths = [np.asarray(Trajectory(result.trajectories[row]).matrices, float) for row in order]
+        paths = [np.asarray(Trajectory(jnp.asarray(result.trajectories[row])).matrices, float) for row in order]
         motion = np.asarray(Trajectory(result.object_motion[None]).matrices[0], float)
         return paths, motion
 

@@ -1,4 +1,4 @@
-"""What touches what in a cell, for a motion that is planned: the arm, the hand, the held object and the surroundings."""
+"""What touches what in a cell at planned positions: the arm, the hand, the held object and the surroundings."""
 
 import dataclasses
 import functools

@@ -271,7 +271,7 @@ def _judged(episode: Episode, cell: Workcell, data: Any) -> tuple[bool, bool, st
 
 
 def _pick_error(episode: Episode, pick) -> str:
-    """What is wrong with a pick, in words; empty if it is near a true one, up to the turn about a round object's axis."""
+    """What is wrong with a pick, in words; empty near a true one, up to the turn about a round object's axis."""
     local = np.linalg.inv(episode.T_world_object) @ pick
     true = episode.grip.T_object_grip
     turns = np.linspace(0, 2 * np.pi, 180, endpoint=False) if episode.object.fold == 0 else [0.0]

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from tdf_jax.sim.joint_trajectory import JointTrajectory
 from tdf_jax.sim.physics import TIMESTEP, extra
@@ -64,7 +63,7 @@ class Controller:
         mujoco.mj_mulM(model, data, inertia, wanted)
         ahead = self.damping * table["velocity"][step] + inertia[cell.arm_dofs]  # type: ignore[attr-defined]
         data.ctrl[cell.arm_actuators] = table["position"][step] + ahead / self.stiffness  # type: ignore[attr-defined]
-        data.ctrl[cell.finger_actuator] = cell.robot.fingers.command(float(table["opening"][step]))
+        data.ctrl[cell.finger_actuator] = cell.fingers.command(float(table["opening"][step]))
 
 
 def execute(

@@ -118,7 +118,7 @@ class FloatingHand:
 
     def close(self, grip: float, seconds: float) -> None:
         """Command an opening and wait."""
-        self.data.ctrl[self.cell.finger_actuator] = self.cell.robot.fingers.command(grip)
+        self.data.ctrl[self.cell.finger_actuator] = self.cell.fingers.command(grip)
         self.wait(seconds)
 
     def wait(self, seconds: float) -> None:

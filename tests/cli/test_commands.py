@@ -758,6 +758,7 @@ def test_commands_are_the_functions_of_their_modules():
         "dataset",
         "train",
         "reproduce",
+        "simulate",
     }
     for name in command_line.COMMANDS:
         assert callable(getattr(sys.modules[f"tdf_jax.cli.{name}"], name))

@@ -12,6 +12,8 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.sim import retiming
 from tdf_jax.sim.retiming import retime
 
+pytest.importorskip("toppra", reason="the extra 'sim' is not installed")
+
 VELOCITY = np.array([3.1, 3.1, 3.1, 6.2, 1.0, 6.2])
 ACCELERATION = np.array([8.0, 8, 10, 20, 15, 2])
 SLACK = 1e-4  # of the limits: extrema of the speed are taken at five places of each part of the grid
