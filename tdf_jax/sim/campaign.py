@@ -25,7 +25,7 @@ from tdf_jax.sim.tasks import POSES, TASKS
 if TYPE_CHECKING:
     from tdf_jax.sim.robot import Robot
 
-FORMAT = 2  # format number; raise it when what an episode computes changes
+FORMAT = 3  # format number; raise it when what an episode computes changes
 DEMONSTRATIONS = 10  # episodes that demonstrate; with one demonstration, each is that of a tenth of the episodes
 FIRST_DEMONSTRATION = 1_000_000  # their numbers begin here, so that no episode shares their objects
 CLOUDS = ("full", "views3", "views1")

@@ -31,6 +31,10 @@ class Collisions:
         return self.cell.data()
 
     @functools.cached_property
+    def _start(self) -> np.ndarray:
+        return self._data.qpos.copy()
+
+    @functools.cached_property
     def _kinds(self) -> np.ndarray:
         return geom_kinds(self.cell)
 
@@ -57,6 +61,7 @@ class Collisions:
         """
         mujoco = extra("plan_joints()", "mujoco")
         cell, data = self.cell, self._data
+        data.qpos[:] = self._start
         data.qpos[cell.arm] = joints
         cell.open_fingers(data, opening)
         if T_world_object is not None:

@@ -177,7 +177,8 @@ def load_robot(
                 f"load_robot(): {file} is given without a site; name the site of the gripper's frame (z along the "
                 "approach, y along the closing direction)"
             )
-        files, mount, name, yaw = (Path(file),), "", Path(file).stem, 0.0
+        file = checks.path("load_robot()", file, "file")
+        files, mount, name, yaw = (file,), "", file.stem, 0.0
         default_home = None
     spec = _spec(files, mount)
     try:
@@ -222,6 +223,13 @@ def load_robot(
     if start.shape != (len(joints),) or not np.isfinite(start).all():
         raise InputError(f"load_robot(): home is {home}; expected {len(joints)} finite angles, radians")
     limited = model.jnt_limited[joints].astype(bool)
+    lower = np.where(limited, model.jnt_range[joints, 0], -2 * np.pi)
+    upper = np.where(limited, model.jnt_range[joints, 1], 2 * np.pi)
+    if (start < lower).any() or (start > upper).any():
+        raise InputError(
+            f"load_robot(): home is {start.tolist()}, outside of the joints' limits; expected angles from "
+            f"{lower.tolist()} to {upper.tolist()}, radians"
+        )
     return Robot(
         name=name,
         files=tuple(Path(one) for one in files),
@@ -231,8 +239,8 @@ def load_robot(
         actuators=tuple(model.actuator(number).name for number in arm),
         finger_actuator=model.actuator(rest[0]).name,
         home=start,
-        lower=np.where(limited, model.jnt_range[joints, 0], -2 * np.pi),
-        upper=np.where(limited, model.jnt_range[joints, 1], 2 * np.pi),
+        lower=lower,
+        upper=upper,
         max_velocity=np.full(len(joints), float(max_velocity)),
         max_acceleration=np.full(len(joints), float(max_acceleration)),
         yaw=yaw,

@@ -13,6 +13,9 @@ from tdf_jax.sim.robot import PREFIX, Fingers, Robot
 TABLE = ((0.55, 0.0, -0.02), (0.40, 0.60, 0.02))  # centre and half edges, metres; its top is at z = 0
 # Weld between the floating gripper and the frame that drives it: as stiff as an arm's actuators hold a wrist.
 DRIVE_SOLREF = (0.01, 1.0)
+# Anchor at the origin of the second body, the pose between both as it is at the start, and the weight of rotations. The
+# default of a new equality is that of a joint: as a weld, an anchor 1 m away.
+WELD = (*[0.0] * 10, 1.0, 0.0)
 COLOURS = {"object": (0.85, 0.45, 0.25, 1.0), "target": (0.35, 0.55, 0.75, 1.0), "table": (0.75, 0.72, 0.68, 1.0)}
 OBJECT, TARGET, TABLE_NAME, HAND, FIXTURE = "object", "target", "table", "hand", "fixture"
 
@@ -154,7 +157,7 @@ def build_workcell(
         weld = spec.add_equality(
             type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY, name1=HAND, name2=root.name
         )
-        weld.solref = DRIVE_SOLREF
+        weld.solref, weld.data = DRIVE_SOLREF, WELD
     else:
         spec = mujoco.MjSpec()
         set_options(spec)
@@ -180,7 +183,7 @@ def build_workcell(
         spec.worldbody.add_body(name=FIXTURE, pos=pose[:3, 3], quat=quaternion(pose))
         kind, bodies = mujoco.mjtEq.mjEQ_WELD, mujoco.mjtObj.mjOBJ_BODY
         hold = spec.add_equality(name=FIXTURE, type=kind, objtype=bodies, name1=FIXTURE, name2=OBJECT)
-        hold.solref, hold.solimp = SOLREF, (*SOLIMP, 0.5, 2.0)
+        hold.solref, hold.solimp, hold.data = SOLREF, (*SOLIMP, 0.5, 2.0), WELD
     return Workcell(compiled(spec), robot, floating, target is not None, fixed_target)
 
 
