@@ -105,13 +105,16 @@ def plan_joints(
         raise InputError("plan_joints(): trajectory is not one trajectory; expected Trajectory of shape (poses, 7)")
     if not isinstance(robot, Robot):
         raise InputError(f"plan_joints(): robot is {type(robot).__name__}; expected load_robot()")
+    if cell is not None and not isinstance(cell, Workcell):
+        raise InputError(f"plan_joints(): cell is {type(cell).__name__}; expected build_workcell(robot, ...)")
     if cell is not None and (cell.robot is not robot or cell.floating):
         raise InputError(
             "plan_joints(): the cell is not one with this robot's arm; expected build_workcell(robot, ...)"
         )
     checks.positive("plan_joints()", "approach", approach, "metres")
     checks.count("plan_joints()", "seed", seed)
-    wide = robot.fingers.widest if opening is None else float(opening)
+    wide = robot.fingers.widest if opening is None else checks.real("plan_joints()", "opening", opening)
+    grip = checks.real("plan_joints()", "grip", grip)
     if not 0 <= grip < wide <= robot.fingers.widest + 1e-6:
         raise InputError(
             f"plan_joints(): opening is {wide} and grip {grip}; expected 0 <= grip < opening <= "
@@ -387,8 +390,10 @@ def _timed(robot: Robot, to_pick, carried, away, transits, opening: float, grip:
         else:
             factor = CARRYING if name == "path" else 1.0
             t, q = retime(waypoints, factor * robot.max_velocity, factor * robot.max_acceleration, RATE)
-        segments.append((name, sum(len(part) for part in times)))
         keep = slice(0, None) if not times else slice(1, None)  # a phase begins where the one before ended
+        if not len(t[keep]):  # the path of a release at the pick
+            continue
+        segments.append((name, sum(len(part) for part in times)))
         times.append(now + t[keep])
         positions.append(q[keep])
         gripper.append(np.full(len(t[keep]), width))

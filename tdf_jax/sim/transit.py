@@ -54,7 +54,7 @@ def connect(
         bounds.setHigh(number, min(float(high), float(upper[number])))
     space.setBounds(bounds)
     setup = geometric.SimpleSetup(space)
-    setup.setStateValidityChecker(lambda state: free(np.array([state[number] for number in range(count)])))
+    setup.setStateValidityChecker(lambda state: bool(free(np.array([state[number] for number in range(count)]))))
     information = setup.getSpaceInformation()
     information.setStateValidityCheckingResolution(RESOLUTION / space.getMaximumExtent())
     ends = []
