@@ -6,6 +6,7 @@ Modules:
     grid: regular grids along a line, in a plane or in a volume
     paths: demonstrated paths: line, semicircle, wave, lift, tilt, hang
     query: query points of the gripper or the placing region
+    registration: a region of a cloud brought onto another cloud by closest points
     sampling: points of a surface; farthest-point sampling
     se3: rotations and rigid poses
     symmetry: equivalent poses of symmetric objects

@@ -1,0 +1,54 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tdf_jax.geometry.registration import region_distance, register_region
+
+
+def _peg(rng, count=400):
+    """Points on a peg along x that ends at x = 0.03, and on a wall far from it."""
+    angle, along = rng.uniform(0, 2 * np.pi, count), rng.uniform(-0.06, 0.03, count)
+    peg = np.stack([along, 0.005 * np.cos(angle), 0.005 * np.sin(angle)], axis=1)
+    tip = np.concatenate([np.full((40, 1), 0.03), rng.uniform(-0.003, 0.003, (40, 2))], axis=1)
+    return np.concatenate([peg, tip, rng.uniform(-0.1, 0.1, (300, 3)) + [0, 0, 0.5]])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_peg_is_found_beside_the_pose_to_start_from(seed):
+    rng = np.random.default_rng(seed)
+    demonstrated, other = _peg(rng), _peg(rng)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
+    points = other @ T[:3, :3].T + T[:3, 3]
+    wrong = np.eye(4)
+    wrong[:3, :3], wrong[:3, 3] = Rotation.from_rotvec([0.0, 0.25, 0.0]).as_matrix(), [0.008, 0.0, 0.012]
+
+    error = np.linalg.inv(T) @ register_region(demonstrated, points, T @ wrong, 0.04)
+
+    assert np.abs(error[:3, 3]).max() < 0.003
+    assert np.degrees(np.arccos(error[0, 0])) < 3
+
+
+def test_too_few_points_leave_the_pose():
+    rng = np.random.default_rng(0)
+    start = np.eye(4)
+    start[:3, 3] = [0.0, 0.0, 0.3]
+    assert np.array_equal(register_region(_peg(rng), _peg(rng), start, 0.04), start)
+
+
+def test_the_frame_of_the_region_is_free():
+    """A region away from the origin of the contact frame gives the same motion."""
+    rng = np.random.default_rng(1)
+    demonstrated, points = _peg(rng), _peg(rng) + [0.0, 0.0, 0.006]
+    moved = register_region(demonstrated, points, np.eye(4), 0.04)
+    assert moved[2, 3] == pytest.approx(0.006, abs=0.001)
+
+
+def test_the_distance_is_of_the_region_in_both_directions():
+    rng = np.random.default_rng(2)
+    cloud = _peg(rng)
+    assert region_distance(cloud, cloud, np.eye(4), 0.04) == 0
+    beside = np.eye(4)
+    beside[2, 3] = 0.1  # where the cloud has no points
+    assert region_distance(cloud, cloud, beside, 0.04) == np.inf
+    assert 0.001 < region_distance(cloud, cloud + [0.0, 0.02, 0.0], np.eye(4), 0.04) < 0.02
