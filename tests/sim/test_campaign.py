@@ -1,0 +1,122 @@
+"""Campaigns: the same outcomes in any number of processes, kept between runs, and what cannot be measured."""
+
+import numpy as np
+import pytest
+
+from tdf_jax._internal.errors import InputError
+from tdf_jax.sim import campaign
+from tdf_jax.sim.campaign import TRUTH, Condition, Settings, centred_path, check_condition, run_campaign, run_one
+from tdf_jax.sim.report import record
+
+SHELF = Condition("bowl_on_shelf", "known", "upright", "execute", method=TRUTH)
+
+
+def settings(folder, condition=SHELF):
+    return Settings(condition, "bowl", None, 3, folder)
+
+
+@pytest.fixture(scope="module")
+def first(robot, tmp_path_factory):
+    """The outcomes of two episodes, in one process, and the folder that keeps them."""
+    folder = tmp_path_factory.mktemp("campaign")
+    return folder, list(run_campaign(settings(folder), 2, processes=1, progress=False))
+
+
+def compared(folder, runs):
+    made = record(settings(folder), runs)
+    del made["seconds"]
+    return made
+
+
+@pytest.mark.slow
+def test_the_truth_succeeds(first):
+    _, runs = first
+    assert [run.number for run in runs] == [0, 1] and all(run.outcome.overall for run in runs), runs
+
+
+@pytest.mark.slow
+def test_two_processes_give_the_same(first, tmp_path):
+    folder, runs = first
+    again = list(run_campaign(settings(tmp_path), 2, processes=2, progress=False))
+    assert compared(tmp_path, again) == compared(folder, runs)
+
+
+@pytest.mark.slow
+def test_a_run_is_resumed(first, monkeypatch):
+    """What is kept is not run again, and what is missing is."""
+    folder, runs = first
+    bench, calls = campaign._bench(settings(folder)), []
+
+    def run(number):
+        calls.append(number)
+        raise InputError("it runs again")
+
+    monkeypatch.setattr(bench, "run", run)
+    kept = [run_one(settings(folder), number) for number in (0, 1)]
+    assert kept == runs and not calls
+    with pytest.raises(InputError, match="it runs again"):
+        run_one(settings(folder), 2)
+    assert calls == [2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", campaign.METHODS)
+def test_every_method_gives_a_path_and_a_motion(robot, tmp_path, method):
+    bench = campaign._Bench(settings(tmp_path, SHELF._replace(method=method, mass=0.01)))
+    episode, shown = bench.episode(4)
+    assert episode.object_body.mass == 0.01 and shown == 4
+    np.testing.assert_array_equal(episode.T_world_target, bench.shown(4)[0].T_world_target)
+    paths, motion = bench.imitated(episode, shown)
+    for T in (*paths[0], motion):
+        np.testing.assert_allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-4)
+    # The gripper moves with the object from the pick to the release.
+    np.testing.assert_allclose(motion @ paths[0][0], paths[0][-1], atol=2e-3)
+
+
+def test_the_processes_leave_no_setting_behind(monkeypatch):
+    import os
+
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_parallel_codegen_split_count=1")
+    with campaign._pool(1):
+        assert "eigen=false" in os.environ["XLA_FLAGS"] and "split_count" in os.environ["XLA_FLAGS"]
+    assert os.environ["XLA_FLAGS"] == "--xla_cpu_parallel_codegen_split_count=1"
+    monkeypatch.delenv("XLA_FLAGS")
+    with campaign._pool(1):
+        pass
+    assert "XLA_FLAGS" not in os.environ
+
+
+def test_a_centred_path_moves_the_object_as_before(robot):
+    """The pick changes in the gripper, and so does every other pose."""
+    rng = np.random.default_rng(0)
+    path = np.tile(np.diag([1.0, -1, -1, 1]), (5, 1, 1))
+    path[:, :3, 3] = np.cumsum(rng.normal(0, 0.05, (5, 3)), axis=0) + (0.4, 0, 0.2)
+    depth = robot.fingers.depth(0.0)
+    wall = path[0] @ np.array([0, 0.004, depth, 1])
+    spread = np.stack([rng.uniform(-0.01, 0.01, 60), rng.choice([-0.001, 0.001], 60), rng.uniform(-0.02, 0.02, 60)])
+    points = wall[:3] + spread.T
+    centred = centred_path(path, points, 0.05, robot)
+    assert abs(centred[0][1, 3] - path[0][1, 3]) == pytest.approx(0.004, abs=1e-3)
+    for before, after in zip(path, centred):
+        np.testing.assert_allclose(after @ np.linalg.inv(centred[0]), before @ np.linalg.inv(path[0]), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"task": "mug_on_mug"}, "task is 'mug_on_mug'; expected one of"),
+        ({"poses": "tilt30"}, "poses is 'tilt30'"),
+        ({"mode": "think"}, "mode is 'think'"),
+        ({"clouds": "views2"}, "clouds is 'views2'"),
+        ({"method": "luck"}, "method is 'luck'"),
+        ({"target": "found"}, "the shelf of bowl_on_shelf is known"),
+        ({"demonstrations": 5}, "demonstrations is 5; expected 1 or 10"),
+        ({"demonstrations": 10}, "a known target stands where it stood"),
+        ({"task": "bowl_on_mug", "target": "found", "demonstrations": 10}, "truth has one demonstration"),
+    ],
+    ids=lambda value: "" if isinstance(value, dict) else value[:20],
+)
+def test_what_cannot_be_measured_is_refused(change, message):
+    with pytest.raises(InputError, match=f"tdf simulate: {message}"):
+        check_condition(SHELF._replace(**change))
+    check_condition(SHELF)

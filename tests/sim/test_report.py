@@ -1,0 +1,61 @@
+"""The report of a campaign: rates, causes and the record, of outcomes that are known."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tdf_jax.sim.campaign import Condition, Run, Settings
+from tdf_jax.sim.episode import Outcome
+from tdf_jax.sim.report import causes, rates, record, summary
+
+CONDITION = Condition("mug_on_rack", "known", "upright", "execute")
+GOOD = Outcome(True, True, True, True, "", "", 0.002, 1.0)
+SLACK = Outcome(True, True, True, False, "not on the peg", "no peg", 0.004, 3.0)
+FELL = Outcome(True, False, False, False, "fell", "it fell", 0.006, 5.0)
+NEVER = Outcome(False, False, False, False, "unreachable", "far", np.nan, np.nan)
+
+
+@pytest.fixture
+def runs():
+    outcomes = (GOOD, GOOD, SLACK, FELL, FELL, NEVER, GOOD, GOOD)
+    return [
+        Run(CONDITION, number, outcome, number % 3, number % 2, (1.0 + number, 10.0 + number))
+        for number, outcome in enumerate(outcomes)
+    ]
+
+
+def test_rates_count_every_episode(runs):
+    table = rates(runs)
+    assert {name: rate for name, (rate, _) in table.items()} == {
+        "grasp": 7 / 8, "place": 5 / 8, "overall": 5 / 8, "strict": 4 / 8,
+    }  # fmt: skip
+    for rate, (low, high) in table.values():
+        assert 0 <= low < rate < high <= 1
+
+
+def test_causes_are_counted_the_most_frequent_first(runs):
+    assert list(causes(runs).items()) == [("fell", 2), ("not on the peg", 1), ("unreachable", 1)]
+
+
+def test_a_summary_says_all_of_it(runs):
+    text = summary(runs)
+    assert text.startswith("mug_on_rack, target known, upright, execute, full clouds, 1 demonstration, tdf_jax: 8 epi")
+    assert "  overall: 62 % (" in text and "  overall, hung by the handle: 50 % (" in text
+    assert "  failed: fell: 2" in text
+    assert "moved in the hand, median: 2.0 mm, 1.0 degrees" in text  # of 2, 2, 4, 6, 6, 2, 2
+    assert "7 starts out of reach, 4 pairs that do not fit" in text
+    assert "imitation 4.5, physics 13.5" in text
+
+
+def test_a_record_is_json_whose_seconds_stand_apart(runs, tmp_path):
+    settings = Settings(CONDITION, "mug", None, 7, tmp_path)
+    made = record(settings, runs)
+    again = json.loads(json.dumps(made, allow_nan=False))
+    assert again["condition"]["task"] == "mug_on_rack" and again["seed"] == 7
+    assert again["episodes"][5]["slip"] is None and again["episodes"][3]["cause"] == "fell"
+    assert [one["number"] for one in again["episodes"]] == list(range(8))
+    assert again["rates"]["strict"]["rate"] == 0.5 and again["causes"]["fell"] == 2
+    slower = [Run(run.condition, run.number, run.outcome, run.rejected, run.redrawn, (99.0, 99.0)) for run in runs]
+    other = record(settings, slower)
+    assert {key for key in made if made[key] != other[key]} == {"seconds"}
