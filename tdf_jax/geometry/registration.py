@@ -2,7 +2,6 @@
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import KDTree
 
 ROUNDS = 40
 LEAST = 8  # points of either cloud in the region; with fewer there is nothing to register
@@ -34,6 +33,8 @@ def register_region(
     References:
         Besl, McKay, "A method for registration of 3-D shapes", IEEE TPAMI 1992.
     """
+    from scipy.spatial import KDTree
+
     demonstrated, points = np.asarray(demonstrated, float), np.asarray(points, float)
     tree = KDTree(demonstrated)
     region = demonstrated[np.abs(demonstrated).max(axis=1) < radius]
@@ -70,6 +71,8 @@ def region_distance(
     Returns:
         The distance; infinite if too few points of either cloud are in the region.
     """
+    from scipy.spatial import KDTree
+
     T, demonstrated = np.asarray(T_world_region, float), np.asarray(demonstrated, float)
     local = (np.asarray(points, float) - T[:3, 3]) @ T[:3, :3]
     regions = [cloud[np.abs(cloud).max(axis=1) < radius] for cloud in (demonstrated, local)]
