@@ -159,9 +159,7 @@ def _turned_down(direction: np.ndarray) -> np.ndarray:
     return np.asarray(se3.exp(angle * axis), float)
 
 
-def hole_is_crossed(
-    mug: Mug, line: Float[np.ndarray, "2 3"], T_target_mug: Float[np.ndarray, "4 4"]
-) -> bool:
+def hole_is_crossed(mug: Mug, line: Float[np.ndarray, "2 3"], T_target_mug: Float[np.ndarray, "4 4"]) -> bool:
     """Whether a line from one point to another, such as a peg's axis, goes through a mug's finger hole.
 
     Args:
