@@ -24,6 +24,8 @@ def simulate(
     light: bool = False,
     object_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
     target_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
+    robot: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: UR5e and 2F-85)")] = None,
+    site: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint=_NONE)] = None,
     processes: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_CORES)] = None,
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=_NONE)] = None,
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=_NONE)] = None,
@@ -50,6 +52,8 @@ def simulate(
         light: objects of 0.01 kg, as in NDF and R-NDF, instead of 0.10 to 0.40 kg by volume.
         object_weights: weights of the object.
         target_weights: weights of the target.
+        robot: MJCF of another arm with a parallel gripper.
+        site: site of that file that is the gripper's frame: z along the approach, y along the closing direction.
         processes: number of processes, on which the outcomes do not depend.
         video: film of the first episode, a .gif or .mp4 file; only of executed ones.
         json: file for all outcomes.
@@ -63,6 +67,7 @@ def simulate(
     from tdf_jax.sim.physics import LIGHT_MASS, extra
     from tdf_jax.sim.recording import ENDINGS
     from tdf_jax.sim.report import record, summary
+    from tdf_jax.sim.robot import load_robot
     from tdf_jax.sim.tasks import TASKS
 
     if episodes < 1:
@@ -90,6 +95,7 @@ def simulate(
             f"tdf simulate: there are no shipped weights of a {TASKS[task].target}; expected --target known, or "
             "--target-weights FILE of a network from tdf train"
         )
+    load_robot(robot, site)
     object_weights = object_weights or TASKS[task].object
     for weights in (object_weights, target_weights):
         if weights is not None:
@@ -98,7 +104,7 @@ def simulate(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"tdf simulate: cannot make the folder {out} ({error}); expected a writable place") from None
-    settings = Settings(condition, object_weights, target_weights, seed, out.resolve())
+    settings = Settings(condition, object_weights, target_weights, seed, out.resolve(), robot, site)
     runs = list(run_campaign(settings, episodes, processes))
     print(summary(runs))
     if json is not None:

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from tqdm import tqdm
 
 from tdf_jax._internal import checks, workers
-from tdf_jax._internal.cache import kept
+from tdf_jax._internal.cache import digest, kept
 from tdf_jax._internal.errors import InputError
 from tdf_jax.sim.episode import MODES, Outcome
 from tdf_jax.sim.tasks import POSES, TASKS
@@ -90,6 +90,7 @@ class Settings:
         object_weights, target_weights: names or files of the networks; the latter None if there is none.
         seed: seed of everything.
         folder: existing folder that keeps outcomes.
+        robot, site: MJCF of another robot and the site of its gripper's frame; see `load_robot`.
     """
 
     condition: Condition
@@ -97,6 +98,8 @@ class Settings:
     target_weights: str | None
     seed: int
     folder: Path
+    robot: Path | None = None
+    site: str | None = None
 
 
 def check_condition(condition: Condition) -> None:
@@ -186,7 +189,7 @@ def run_one(settings: Settings, number: int) -> Run:
     """
     condition = settings.condition
     bench = _bench(settings)
-    about = [FORMAT, version("tdf_jax"), *bench.fingerprints, *condition, settings.seed, number]
+    about = [FORMAT, version("tdf_jax"), *bench.fingerprints, *bench.robot_content, *condition, settings.seed, number]
     result = kept("tdf simulate", settings.folder, about, functools.partial(bench.run, number))
     fields = {field.name: result[field.name].item() for field in dataclasses.fields(Outcome)}
     seconds = (float(result["seconds"][0]), float(result["seconds"][1]))
@@ -258,12 +261,14 @@ class _Bench:
         from tdf_jax.sim.robot import load_robot
 
         self.settings, self.condition = settings, settings.condition
-        self.robot = load_robot()
+        self.robot = load_robot(settings.robot, settings.site)
         self.model = load_model(settings.object_weights)
         self.target_model = None if settings.target_weights is None else load_model(settings.target_weights)
         self.fingerprints = [
             fingerprint(self.model), None if self.target_model is None else fingerprint(self.target_model)
         ]  # fmt: skip
+        # Of the package's robot nothing: its version is pinned.
+        self.robot_content = [] if settings.robot is None else [digest(settings.robot.read_bytes()), settings.site]
         self._shown: dict[int, tuple] = {}
         self._described: dict[int, object] = {}
 

@@ -4,11 +4,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from tdf_jax.sim.grasps import TIPS
 from tdf_jax.sim.robot import Fingers
 
 BESIDE = 0.014  # metres, half width of the region between the fingers, along x
 BEHIND, BEYOND = 0.038, 0.004  # metres behind and beyond the tips of the pads, along the approach
-TIPS = 0.0187  # metres from the middle of the pads to their tips
 LEAST = 8  # points; with fewer the grasp stays as it is
 STEEPEST = np.radians(40)  # a steeper wall is another surface
 LONGEST = 0.015  # metres, largest movement along the closing direction
@@ -25,7 +25,7 @@ def centred(
     """Move a grasp along its closing direction to the middle of what is between the fingers, and turn it along a wall.
 
     Pads press flat on a wall that is parallel to them; on a sloping one they touch at an edge, and the object turns in
-    the hand. The turn is about the x axis, through the tips.
+    the hand. The turn is about the x axis, through the middle of what is between the fingers.
 
     Args:
         T_world_grip: pose of the gripper's frame, 4x4, metres, world frame.
@@ -44,7 +44,6 @@ def centred(
         if between.sum() < LEAST:
             return T
         y, z = y[between], z[between]
-        # The middle of both surfaces, by heights: a cloud has more points on the outer one.
         slope, middle = _line(y, z)
         angle = float(np.clip(np.arctan(slope), -STEEPEST, STEEPEST))
         shift = float(np.clip(middle + slope * z.mean(), -LONGEST, LONGEST))

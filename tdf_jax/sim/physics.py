@@ -15,7 +15,6 @@ IMPRATIO = 10.0
 FRICTION = (0.8, 0.005, 0.0001)  # sliding, torsional (metres), rolling (metres)
 SOLREF = (0.005, 1.0)  # time constant of a contact, seconds, and its damping ratio
 SOLIMP = (0.95, 0.99, 0.001)  # as of the fingers
-MARGIN = 0.0  # metres
 # Masses by volume, within limits: of solid clay, the thin-walled mugs and the solid bottles would weigh up to 8.7 kg.
 DENSITY = 400.0  # kg/m3
 MASSES = (0.10, 0.40)  # kg

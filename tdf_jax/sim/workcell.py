@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tdf_jax.sim.bodies import Body
-from tdf_jax.sim.physics import FRICTION, MARGIN, SOLIMP, SOLREF, compiled, extra, set_options
+from tdf_jax.sim.physics import FRICTION, SOLIMP, SOLREF, compiled, extra, set_options
 from tdf_jax.sim.robot import PREFIX, Fingers, Robot
 
 TABLE = ((0.55, 0.0, -0.02), (0.40, 0.60, 0.02))  # centre and half edges, metres; its top is at z = 0
@@ -208,4 +208,3 @@ def _add_body(mujoco, spec, name: str, body: Body, T, free: bool) -> None:
 
 def _set_contact(geom) -> None:
     geom.friction, geom.solref, geom.solimp = FRICTION, SOLREF, (*SOLIMP, 0.5, 2.0)
-    geom.margin = MARGIN

@@ -46,6 +46,8 @@ def refusal(tmp_path, capsys, monkeypatch):
         (["--demonstrations", 10], "a known target stands where it stood in one demonstration"),
         (["--demonstrations", 10, "--target", "found", "--method", "ICP"], "ICP has one demonstration"),
         (["--object-weights", "nothing"], "nothing"),
+        (["--robot", "arm.xml", "--site", "pinch"], "there is no file arm.xml; expected an MJCF"),
+        (["--site", "pinch"], "there is a site and no file"),
         (["--target-weights", "nothing.safetensors"], "nothing.safetensors"),
         (["--task", "mug_on_mug"], "mug_on_mug"),
         (["--pose", "sideways"], "sideways"),
