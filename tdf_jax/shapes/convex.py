@@ -330,8 +330,6 @@ def _shell(outer: _Stack, inner: _Stack, levels: np.ndarray) -> Iterator[np.ndar
     unit, at = _fine_outline(holes[0] / sizes[0])
     table = _sector_table(np.round(unit, 12).tobytes(), len(unit))
     slant = _slant(holes[-1], bodies[-1])
-    if np.linalg.norm(holes[0], axis=1).min() < 0.9 * sizes[0]:
-        slant = min(slant, np.sqrt(0.5))  # a chord may end in the middle of a rounded corner, which moves diagonally
 
     # The fewest sectors in all, by dynamic programming over the levels to cut at.
     count = len(levels)

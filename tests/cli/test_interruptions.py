@@ -381,7 +381,7 @@ def test_a_stopped_process_leaves_nothing_that_stays(weights, tmp_path, number):
     with tdf_process(*words) as process:
         while not list(out.parent.iterdir()):
             assert process.poll() is None
-            time.sleep(0.01)
+            time.sleep(0.001)
         process.send_signal(number)
         output, messages = process.communicate()
     assert process.returncode == (143 if number == signal.SIGTERM else -9)
