@@ -17,15 +17,22 @@ class Controller:
 
     The command of a position actuator is the planned position, with what it takes to keep up: the damping times the
     planned velocity and the arm's inertia times the planned acceleration, over the actuator's stiffness. Without it the
-    UR5e is 0.2 s behind. Gravity on the arm itself is compensated (`tdf_jax.sim.robot`), that on what it holds is not.
+    UR5e's model, by its damping over its stiffness, would be 0.2 s behind. Gravity on the arm itself is compensated
+    (`tdf_jax.sim.robot`), that on what it holds is not.
 
     Attributes:
         cell: the cell, with the arm.
         motion: the trajectory.
+        table: what is planned for every step of the physics, by name: position, velocity and acceleration of the
+            joints, (steps, joints), and opening, (steps,).
+        stiffness, damping: of the arm's actuators, (joints,).
     """
 
     cell: Workcell
     motion: JointTrajectory
+    table: dict[str, np.ndarray] = dataclasses.field(init=False)
+    stiffness: np.ndarray = dataclasses.field(init=False)
+    damping: np.ndarray = dataclasses.field(init=False)
 
     def __post_init__(self):
         """Sample the trajectory at every step of the physics."""
@@ -51,18 +58,18 @@ class Controller:
     @property
     def num_steps(self) -> int:
         """Number of steps of the physics."""
-        return len(self.table["opening"])  # type: ignore[attr-defined]
+        return len(self.table["opening"])
 
     def command(self, data: Any, step: int) -> None:
         """Set the actuators for a step of the physics."""
         mujoco = extra("Controller", "mujoco")
-        cell, table = self.cell, self.table  # type: ignore[attr-defined]
+        cell, table = self.cell, self.table
         model = cell.model
         wanted, inertia = np.zeros(model.nv), np.zeros(model.nv)
         wanted[cell.arm_dofs] = table["acceleration"][step]
         mujoco.mj_mulM(model, data, inertia, wanted)
-        ahead = self.damping * table["velocity"][step] + inertia[cell.arm_dofs]  # type: ignore[attr-defined]
-        data.ctrl[cell.arm_actuators] = table["position"][step] + ahead / self.stiffness  # type: ignore[attr-defined]
+        ahead = self.damping * table["velocity"][step] + inertia[cell.arm_dofs]
+        data.ctrl[cell.arm_actuators] = table["position"][step] + ahead / self.stiffness
         data.ctrl[cell.finger_actuator] = cell.fingers.command(float(table["opening"][step]))
 
 
