@@ -19,7 +19,7 @@ from tqdm import tqdm
 from tdf_jax._internal import checks, workers
 from tdf_jax._internal.cache import digest, kept
 from tdf_jax._internal.errors import InputError
-from tdf_jax.sim.episode import MODES, Outcome
+from tdf_jax.sim.episode import MODES, NOT_FOUND, Outcome
 from tdf_jax.sim.tasks import POSES, TASKS
 
 if TYPE_CHECKING:
@@ -206,14 +206,16 @@ def film(settings: Settings, number: int, path: Path) -> Outcome:
         path: .gif or .mp4 file.
 
     Raises:
-        InputError: nothing can be rendered here, or the ending is another one.
+        InputError: nothing can be rendered here, the ending is another one, or the episode has no motion.
     """
     from tdf_jax.sim.episode import run_episode
     from tdf_jax.sim.recording import Recorder
 
     bench = _bench(settings)
     episode, shown = bench.episode(number)
-    candidates, _ = bench.imitated(episode, shown)
+    found = bench.found(episode, shown)
+    if isinstance(found, Outcome):
+        raise InputError(f"tdf simulate: episode {number} has no motion to film: {found.detail}")
     recorder: list[Recorder] = []
 
     def watch(cell, data, phase):
@@ -222,7 +224,7 @@ def film(settings: Settings, number: int, path: Path) -> Outcome:
         recorder[0].watch(data, phase=phase)
 
     try:
-        outcome = run_episode(episode, bench.robot, candidates, watch=watch)
+        outcome = run_episode(episode, bench.robot, found[0], watch=watch)
         if not recorder:
             raise InputError(f"tdf simulate: episode {number} has no motion to film: {outcome.detail}")
         recorder[0].save(path)
@@ -318,12 +320,14 @@ class _Bench:
         condition = self.condition
         episode, shown = self.episode(number)
         began = time.perf_counter()
-        candidates, motion = self.imitated(episode, shown)
+        found = self.found(episode, shown)
         imitated = time.perf_counter()
-        if condition.mode == "execute":
-            outcome = run_episode(episode, self.robot, candidates)
+        if isinstance(found, Outcome):
+            outcome = found
+        elif condition.mode == "execute":
+            outcome = run_episode(episode, self.robot, found[0])
         else:
-            outcome = teleport(episode, self.robot, candidates[0][0], motion)
+            outcome = teleport(episode, self.robot, found[0][0][0], found[1])
         seconds = imitated - began, time.perf_counter() - imitated
         return {
             **dataclasses.asdict(outcome),
@@ -332,8 +336,21 @@ class _Bench:
             "seconds": seconds,
         }
 
+    def found(self, episode, shown: int) -> tuple[Sequence[np.ndarray], np.ndarray] | Outcome:
+        """What is imitated in an episode; its outcome if nothing is found, or no camera sees one of the bodies."""
+        if self.condition.method in (LIBRARY, UNCENTRED):
+            self.reference(shown)  # what is wrong with the weights is no failure of an episode, and ends the campaign
+        try:
+            return self.imitated(episode, shown)
+        except InputError as error:
+            return Outcome.failure(NOT_FOUND, str(error))
+
     def imitated(self, episode, shown: int) -> tuple[Sequence[np.ndarray], np.ndarray]:
-        """Trajectories of the gripper, the best first, and the motion of the object, by the condition's method."""
+        """Trajectories of the gripper, the best first, and the motion of the object, by the condition's method.
+
+        Raises:
+            InputError: there are none, or a cloud is empty or too small.
+        """
         from tdf_jax.sim.tasks import demonstrate_episode
 
         condition = self.condition
@@ -393,6 +410,8 @@ class _Bench:
         )
         finite = np.asarray(result.finite)
         order = [row for row in np.argsort(np.asarray(result.energies), kind="stable") if finite[row]]
+        if not order:
+            raise InputError(f"imitate(): no candidate is finite: {result.status}")
         paths = [np.asarray(Trajectory(jnp.asarray(result.trajectories[row])).matrices, float) for row in order]
         motion = np.asarray(Trajectory(result.object_motion[None]).matrices[0], float)
         return paths, motion

@@ -28,7 +28,9 @@ LOST = 0.1  # seconds without contact after which the object is not in the hand 
 WATCHED = 5  # steps of the physics between looks
 # Errors of a pick, metres and degrees, from which it is the pick that failed.
 WRONG_PICK = (0.03, 30.0)
+NOT_FOUND = "not found"  # there is no pick or no goal to execute
 CAUSES = (
+    NOT_FOUND,
     "pick wrong",
     "unreachable",
     "slipped",
@@ -65,6 +67,16 @@ class Outcome:
     detail: str
     slip: float
     turn: float
+
+    @classmethod
+    def failure(cls, cause: str, detail: str) -> "Outcome":
+        """The outcome of an episode in which nothing moved.
+
+        Args:
+            cause: one of `CAUSES`.
+            detail: more about it, in words.
+        """
+        return cls(False, False, False, False, cause, detail, np.nan, np.nan)
 
 
 def teleport(
@@ -135,7 +147,7 @@ def run_episode(
     plan = plan_motion(candidates, robot, opening=episode.grip.opening, grip=0.0, cell=cell, seed=seed)
     wrong = _pick_error(episode, np.asarray(candidates[0][0]))
     if isinstance(plan, Failure):
-        return _failed("pick wrong" if wrong else "unreachable", wrong or plan.reason)
+        return Outcome.failure("pick wrong" if wrong else "unreachable", wrong or plan.reason)
     data = cell.data()
     observer = _Observer(cell, watch)
     execute(cell, data, plan.motion, observer)
@@ -289,7 +301,3 @@ def _pick_error(episode: Episode, pick) -> str:
     if distance > WRONG_PICK[0] or best[1] > WRONG_PICK[1]:
         return f"{1e2 * distance:.1f} cm and {best[1]:.0f} degrees from a true pick"
     return ""
-
-
-def _failed(cause: str, detail: str) -> Outcome:
-    return Outcome(False, False, False, False, cause, detail, np.nan, np.nan)

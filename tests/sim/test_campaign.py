@@ -1,10 +1,14 @@
 """Campaigns: the same outcomes in any number of processes, kept between runs, and what cannot be measured."""
 
+import types
+
 import numpy as np
 import pytest
+import trimesh
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.sim import campaign
+from tdf_jax.sim.bodies import Body
 from tdf_jax.sim.campaign import TRUTH, Condition, Settings, centred_path, check_condition, run_campaign, run_one
 from tdf_jax.sim.report import record
 
@@ -71,6 +75,84 @@ def test_every_method_gives_a_path_and_a_motion(robot, tmp_path, method):
         np.testing.assert_allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-4)
     # The gripper moves with the object from the pick to the release.
     np.testing.assert_allclose(motion @ paths[0][0], paths[0][-1], atol=2e-3)
+
+
+@pytest.fixture
+def bench(tmp_path, monkeypatch):
+    """A bench by condition, without a robot or networks, whose only episode is two balls on a table."""
+    ball = trimesh.creation.icosphere(1, 0.04)
+    body = Body([np.asarray(ball.vertices)], 0.1, np.zeros(3), 1e-4 * np.eye(3), ball)
+    starts = np.tile(np.eye(4), (2, 1, 1))
+    starts[:, :3, 3] = [(0.4, 0.2, 0.04), (0.6, -0.2, 0.04)]
+    shape = types.SimpleNamespace(mesh=ball)
+    episode = types.SimpleNamespace(
+        **{"number": 0, "rejected": 0, "redrawn": 0, "object": shape, "target": shape, "T_target_object": np.eye(4)},
+        **{"object_body": body, "target_body": body, "T_world_object": starts[0], "T_world_target": starts[1]},
+    )
+    monkeypatch.setattr(campaign._Bench, "episode", lambda self, number: (episode, 0))
+    monkeypatch.setattr("tdf_jax.sim.robot.load_robot", lambda *about: None)
+    monkeypatch.setattr("tdf_jax.networks.checkpoint.load_model", lambda name: name)
+    monkeypatch.setattr("tdf_jax.networks.model.fingerprint", lambda model: model)
+    monkeypatch.setattr(campaign._Bench, "reference", lambda self, shown: None)
+    return lambda **change: campaign._Bench(settings(tmp_path, SHELF._replace(**change)))
+
+
+def result(**change):
+    return types.SimpleNamespace(
+        **{"finite": [False, False], "energies": [np.nan, np.nan], "status": "2 of 2 candidates", **change}
+    )
+
+
+def refuse(*arguments, **keywords):
+    raise InputError("relate(): the clouds are far apart; expected them in one frame")
+
+
+@pytest.mark.parametrize("mode", ["execute", "teleport"])
+@pytest.mark.parametrize(
+    ("where", "what", "detail"),
+    [
+        ("tdf_jax.imitation.imitate", lambda *arguments, **keywords: result(), "no candidate is finite: 2 of 2 cand"),
+        ("tdf_jax.imitation.imitate", refuse, "relate(): the clouds are far apart; expected them in one frame"),
+    ],
+)
+def test_an_episode_in_which_nothing_is_found_fails(bench, monkeypatch, mode, where, what, detail):
+    monkeypatch.setattr(where, what)
+    kept = bench(method=campaign.LIBRARY, mode=mode).run(0)
+    assert kept["cause"] == "not found" and detail in kept["detail"]
+    assert not (kept["grasp"] or kept["place"] or kept["overall"] or kept["strict"]) and np.isnan(kept["slip"])
+
+
+def test_an_episode_whose_target_no_camera_sees_fails(bench, monkeypatch):
+    """One camera sees the object; the target is hidden from it, as by a wall."""
+    from tdf_jax.sim import cameras
+
+    see = cameras.observed_points
+
+    def hidden(model, data, rig, name, **options):
+        if name == "target":
+            rig = [cameras.look_at(one.T_world_camera[:3, 3], one.T_world_camera[:3, 3] + (0, 0, 1)) for one in rig]
+        return see(model, data, rig, name, **options)
+
+    monkeypatch.setattr(cameras, "observed_points", hidden)
+    kept = bench(method=campaign.REPLAY, clouds="views1").run(0)
+    assert kept["cause"] == "not found" and "none of 1 cameras sees the body 'target'" in kept["detail"]
+
+
+def test_an_outcome_without_motion_is_kept_and_cannot_be_filmed(bench, tmp_path, monkeypatch):
+    monkeypatch.setattr("tdf_jax.imitation.imitate", refuse)
+    made = bench(method=campaign.LIBRARY)
+    monkeypatch.setattr(campaign, "_bench", lambda settings: made)
+    first, again = (run_one(made.settings, 0) for _ in range(2))
+    assert first.outcome.cause == again.outcome.cause == "not found" and first.outcome.detail == again.outcome.detail
+    with pytest.raises(InputError, match=r"episode 0 has no motion to film: relate\(\): the clouds are far apart"):
+        campaign.film(made.settings, 0, tmp_path / "film.gif")
+
+
+def test_wrong_weights_are_no_failure_of_an_episode(bench, monkeypatch):
+    made = bench(method=campaign.LIBRARY)
+    monkeypatch.setattr(campaign._Bench, "reference", refuse)
+    with pytest.raises(InputError, match="far apart"):
+        made.run(0)
 
 
 def test_the_processes_leave_no_setting_behind(monkeypatch):
