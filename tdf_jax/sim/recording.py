@@ -259,6 +259,25 @@ def save_film(path: str | os.PathLike, frames: list[UInt8[np.ndarray, "height wi
     replace_file(name, path, content)
 
 
+def check_film(path: str | os.PathLike) -> None:
+    """Raise InputError unless films can be rendered here, and saved under a name; nothing is written.
+
+    Call it before the run whose film is wanted: a picture of an empty world is rendered.
+
+    Args:
+        path: file that is to be written, `.gif` or `.mp4`.
+
+    Raises:
+        InputError: nothing renders off screen here, or see `Recorder.save`.
+    """
+    if _ending("save_film()", path, ENDINGS) == ".mp4":
+        _ffmpeg()
+    mujoco = extra("Recorder", "mujoco")
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    with Recorder(model) as recorder:
+        recorder.picture(mujoco.MjData(model))
+
+
 def gl_context(width: int, height: int) -> Any:
     """A context of OpenGL that renders off screen: the one that `MUJOCO_GL` names, or the first that works.
 
@@ -337,14 +356,7 @@ def _gif(images: list, rate: float) -> bytes:
 
 
 def _mp4(frames: list[np.ndarray], rate: float) -> bytes:
-    try:
-        ffmpeg = importlib.import_module("imageio_ffmpeg")
-    except ImportError:
-        raise InputError(
-            "save_film(): MP4 needs the package imageio-ffmpeg, which is not installed; pip install imageio-ffmpeg, or "
-            "write a .gif"
-        ) from None
-    height, width = frames[0].shape[:2]
+    ffmpeg, (height, width) = _ffmpeg(), frames[0].shape[:2]
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "film.mp4"
         writer = ffmpeg.write_frames(str(file), (width, height), fps=rate, quality=8, macro_block_size=2)
@@ -353,3 +365,13 @@ def _mp4(frames: list[np.ndarray], rate: float) -> bytes:
             writer.send(np.ascontiguousarray(frame))
         writer.close()
         return file.read_bytes()
+
+
+def _ffmpeg() -> Any:
+    try:
+        return importlib.import_module("imageio_ffmpeg")
+    except ImportError:
+        raise InputError(
+            "save_film(): MP4 needs the package imageio-ffmpeg, which is not installed; pip install imageio-ffmpeg, or "
+            "write a .gif"
+        ) from None

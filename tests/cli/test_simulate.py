@@ -74,6 +74,17 @@ def test_a_missing_extra_is_named(refusal, monkeypatch):
     assert "mink is not installed" in (error := refusal()) and "pip install 'tdf_jax[sim]'" in error
 
 
+def test_a_film_that_nothing_here_renders_is_refused(refusal, monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    error = refusal("--video", "film.gif")
+    assert "nothing renders off screen here (MUJOCO_GL is disable)" in error and "set MUJOCO_GL=egl" in error
+
+
+def test_a_film_that_nothing_here_writes_is_refused(refusal, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    assert "MP4 needs the package imageio-ffmpeg" in refusal("--video", "film.mp4")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["execute", "teleport"])
 def test_a_run_prints_rates_and_writes_them(tmp_path, capsys, mode):

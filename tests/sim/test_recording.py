@@ -64,6 +64,13 @@ def test_a_picture_shows_the_cell_in_good_light(cell):
     assert np.mean(picture[:10]) > 150
 
 
+def test_a_film_is_possible_where_pictures_are(cell, tmp_path):
+    recording.check_film(tmp_path / "film.gif")
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(InputError, match="film.avi; expected a name that ends in .gif or .mp4"):
+        recording.check_film(tmp_path / "film.avi")
+
+
 def test_pictures_leave_the_model_and_the_state_as_they_are_and_are_equal_again(cell):
     model, data = cell
     before = np.zeros(mujoco.mj_sizeModel(model), np.uint8), data.qpos.copy()
