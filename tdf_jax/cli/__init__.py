@@ -5,5 +5,6 @@ Modules:
     options: options that commands share
     pictures: optional outputs, which may fail
     streams: standard output and error, which may fail
+    episodes: rows of simulated episodes beside published ones
     tasks: generated objects and targets
 """

@@ -10,9 +10,12 @@ import tyro
 
 _NONE = "(default: none)"
 _CATEGORY = "(default: those of the category)"
+_ALL = "(default: all)"
+_PROTOCOLS = "(default: those of the published protocols)"
+_CORES = "(default: one for every core)"
 PAGE, RECORD, RUNS = "benchmark.md", "benchmark.json", "runs"
 RELATIONS_PAGE, RELATIONS_RECORD = "relations.md", "relations.json"
-Task = Literal["bowl_on_mug", "mug_on_rack", "bottle_in_container"]
+Task = Literal["bowl_on_mug", "mug_on_rack", "bottle_in_container", "bowl_on_shelf", "bottle_on_shelf"]
 Pose = Literal["upright", "tilt60", "uniform"]
 Cloud = Literal[
     "full", "views1", "views2", "views3", "views4", "points300", "points1000", "points3000", "noise", "half", "double"
@@ -25,24 +28,44 @@ def benchmark(
     seed: int = 0,
     height: float = 0.12,
     clouds: tuple[Cloud, ...] = ("full",),
-    methods: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")] = ("all",),
+    methods: Annotated[
+        tuple[str, ...] | None,
+        tyro.conf.arg(metavar="[NAME [NAME ...]]", help_behavior_hint="(default: all; tdf_jax with --simulation)"),
+    ] = None,
     num_starts: int = 10,
     meshes: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint=_NONE)] = None,
     recursive: bool = False,
     num_poses: int = 6,
     demonstrations: Annotated[tuple[int, ...], tyro.conf.arg(metavar="INT", help_behavior_hint=_NONE)] = (),
     relations: bool = False,
-    tasks: tuple[Task, ...] = typing.get_args(Task),
-    pose: tuple[Pose, ...] = typing.get_args(Pose),
+    simulation: bool = False,
+    tasks: Annotated[
+        tuple[Task, ...] | None, tyro.conf.arg(metavar="[TASK [TASK ...]]", help_behavior_hint=_ALL)
+    ] = None,
+    pose: Annotated[
+        tuple[Pose, ...] | None,
+        tyro.conf.arg(
+            metavar="[POSE [POSE ...]]", help_behavior_hint="(default: all; upright and tilt60 with --simulation)"
+        ),
+    ] = None,
+    modes: tuple[Literal["teleport", "execute"], ...] = ("teleport", "execute"),
+    targets: Annotated[
+        tuple[Literal["known", "found"], ...] | None,
+        tyro.conf.arg(metavar="[TARGET [TARGET ...]]", help_behavior_hint=_PROTOCOLS),
+    ] = None,
+    episodes: int = 100,
+    light: bool = False,
+    processes: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_CORES)] = None,
     object_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
     target_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("benchmark"),
 ) -> None:
     """Imitate whole trajectories on unseen mugs, and measure every method against the ground truth.
 
-    With --relations, place objects on unseen targets instead, and judge the placements. Writes benchmark.md,
-    benchmark.json and pictures, or relations.md and relations.json. A run that was interrupted, or that is repeated
-    with more pairs, clouds or methods, computes only what is missing.
+    With --relations, place objects on unseen targets instead, and judge the placements. With --simulation, run rows of
+    episodes in physics as `tdf simulate` does. Writes benchmark.md, benchmark.json and pictures; or relations.md and
+    relations.json; or simulation.md and simulation/simulation.json. A run that was interrupted, or that is repeated
+    with more pairs, episodes, clouds or methods, computes only what is missing.
 
     Args:
         weights: a name of shipped weights, or a .safetensors file.
@@ -50,7 +73,8 @@ def benchmark(
             --meshes.
         seed: seed of the mugs, poses, goals, query points and starts.
         height: height of generated mugs, metres.
-        clouds: conditions of the new object's cloud; see docs/guide/evaluation.md.
+        clouds: conditions of the new object's cloud; see docs/guide/evaluation.md; with --simulation full, views3 and
+            views1.
         methods: names of methods as on the page, or all.
         num_starts: number of random starts of Adam and ICP; the library's own solver takes 64 coarse ones.
         meshes: folder of real mugs with a meshes.json; see docs/guide/evaluation.md.
@@ -60,9 +84,17 @@ def benchmark(
             --relations 1 (by default), 10, or both.
         relations: place one object on another, as in Relational NDF; of the options above, only --pairs, --seed,
             --clouds, --methods and --demonstrations apply.
-        tasks: tasks of --relations.
-        pose: poses of both objects of --relations: upright with a random yaw, with roll and pitch within 60 degrees
-            too, or uniform.
+        simulation: run a robot in physics, and write the rates beside published ones; needs the extra "sim"; of the
+            options above, only --seed, --clouds, --methods and --demonstrations apply.
+        tasks: tasks of --relations and --simulation: bowl_on_mug, mug_on_rack and bottle_in_container, and for
+            --simulation bowl_on_shelf and bottle_on_shelf.
+        pose: poses of both objects of --relations, and of the object of --simulation: upright with a random yaw,
+            tilt60 with roll and pitch within 60 degrees too, or uniform.
+        modes: modes of --simulation: the protocol of NDF and R-NDF, and executed motions.
+        targets: targets of --simulation: known where they were demonstrated, or found by their clouds.
+        episodes: number of episodes in every row of --simulation.
+        light: teleported objects of --simulation weigh 0.01 kg, as in NDF and R-NDF.
+        processes: number of processes of --simulation, on which the outcomes do not depend.
         object_weights: weights of the object of --relations.
         target_weights: weights of the target of --relations.
         out: folder for the page; its folder runs keeps the computed attempts.
@@ -78,21 +110,42 @@ def benchmark(
     from tdf_jax.geometry.winding import libigl
     from tdf_jax.networks.checkpoint import load_model
 
+    if relations and simulation:
+        raise InputError("tdf benchmark: --relations and --simulation are given; expected one of them; drop the other")
+    plain, related, simulated = "", "--relations", "--simulation"
     _refuse_unused(
-        relations,
-        others={
-            "--weights": weights != "mug", "--height": height != 0.12, "--num-starts": num_starts != 10,
-            "--meshes": meshes is not None, "--recursive": recursive, "--num-poses": num_poses != 6,
-        },
-        own={
-            "--tasks": tasks != typing.get_args(Task), "--pose": pose != typing.get_args(Pose),
-            "--object-weights": object_weights is not None, "--target-weights": target_weights is not None,
+        related if relations else simulated if simulation else plain,
+        {
+            "--weights": (weights != "mug", (plain,)), "--height": (height != 0.12, (plain,)),
+            "--num-starts": (num_starts != 10, (plain,)), "--meshes": (meshes is not None, (plain,)),
+            "--recursive": (recursive, (plain,)), "--num-poses": (num_poses != 6, (plain,)),
+            "--pairs": (pairs != 120, (plain, related)),
+            "--tasks": (tasks is not None, (related, simulated)), "--pose": (pose is not None, (related, simulated)),
+            "--object-weights": (object_weights is not None, (related,)),
+            "--target-weights": (target_weights is not None, (related,)),
+            "--modes": (modes != ("teleport", "execute"), (simulated,)),
+            "--targets": (targets is not None, (simulated,)), "--episodes": (episodes != 100, (simulated,)),
+            "--light": (light, (simulated,)), "--processes": (processes is not None, (simulated,)),
         },
     )  # fmt: skip
+    if simulation:
+        from tdf_jax.cli.episodes import measure
+
+        return measure(
+            out,
+            {
+                "tasks": _given(tasks, typing.get_args(Task)), "modes": modes, "targets": targets,
+                "pose": _given(pose, ("upright", "tilt60")), "clouds": clouds, "methods": _given(methods, ("tdf_jax",)),
+                "demonstrations": demonstrations or (1,), "light": light, "episodes": episodes, "seed": seed,
+                "processes": processes,
+            },
+        )  # fmt: skip
+    methods = _given(methods, ("all",))
     if relations:
         settings = {
             "pairs": pairs, "seed": seed, "clouds": clouds, "methods": methods,
-            "demonstrations": demonstrations or (1,), "tasks": tasks, "pose": pose, "object_weights": object_weights,
+            "demonstrations": demonstrations or (1,), "tasks": _given(tasks, typing.get_args(Task)[:3]),
+            "pose": _given(pose, typing.get_args(Pose)), "object_weights": object_weights,
             "target_weights": target_weights,
         }  # fmt: skip
         return _relations(out, settings)
@@ -100,8 +153,8 @@ def benchmark(
     names = list(METHODS) if "all" in methods else [name for name in METHODS if name in methods]
     if meshes is not None:
         libigl("tdf benchmark")
-    targets = [] if meshes is None else load_annotated(meshes, recursive)
-    for target in targets:
+    scans = [] if meshes is None else load_annotated(meshes, recursive)
+    for target in scans:
         if target.category != "mug":
             raise InputError(
                 f"tdf benchmark: --meshes has {target.name}, a {target.category}; expected mugs; tdf evaluate measures "
@@ -112,7 +165,7 @@ def benchmark(
     makers = [
         make
         for condition in dict.fromkeys(clouds)
-        for make in _makers(pairs, seed, height, condition, targets, num_poses)
+        for make in _makers(pairs, seed, height, condition, scans, num_poses)
     ]
     scores = [
         score(method, attempt, task)
@@ -136,16 +189,32 @@ def benchmark(
     _draw(out, makers, scores, extras)
 
 
-def _refuse_unused(relations: bool, others: dict[str, bool], own: dict[str, bool]) -> None:
-    """Refuse options of the other benchmark, which would be ignored."""
+def _given(values: tuple | None, default: tuple) -> tuple:
+    """What an option was given, which may be nothing, or its default."""
+    return default if values is None else values
+
+
+def _refuse_unused(kind: str, options: dict[str, tuple[bool, tuple[str, ...]]]) -> None:
+    """Refuse options of another benchmark, which would be ignored.
+
+    Args:
+        kind: what is run: "" for whole trajectories, "--relations" or "--simulation".
+        options: of each option, whether it is given and the benchmarks that it is for.
+    """
     from tdf_jax._internal.errors import InputError
 
-    for flag, given in (others if relations else own).items():
-        if given:
+    for flag, (given, kinds) in options.items():
+        if not given or kind in kinds:
+            continue
+        if kind:
             raise InputError(
-                f"tdf benchmark: {flag} is {'not for' if relations else 'for'} --relations; expected one without the "
-                f"other; drop {flag}{'' if relations else ', or add --relations'}"
+                f"tdf benchmark: {flag} is not for {kind}; expected one without the other; drop {flag} or {kind}"
             )
+        wanted = " and ".join(kinds)
+        raise InputError(
+            f"tdf benchmark: {flag} is for {wanted}; expected one without the other; drop {flag}, or add "
+            f"{' or '.join(kinds)}"
+        )
 
 
 def _relations(out: Path, settings: dict) -> None:
@@ -166,6 +235,8 @@ def _relations(out: Path, settings: dict) -> None:
     for name in settings["methods"]:
         checks.choice("tdf benchmark", "--methods", name, (*METHODS, "all"))
     names = [name for name in METHODS if {name, "all"} & set(settings["methods"])]
+    for task in settings["tasks"]:
+        checks.choice("tdf benchmark --relations", "--tasks", task, RELATIONS)
     for flag in ("methods", "clouds", "tasks", "pose"):
         if not settings[flag]:
             raise InputError(f"tdf benchmark: --{flag} is empty; expected at least one")

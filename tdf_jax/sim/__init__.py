@@ -19,8 +19,11 @@ Modules:
     grasping: whether a grasp holds an object that is lifted and turned
     centring: a grasp in the middle of what is between the fingers
     tasks: what is picked, where it goes, and where objects start
+    replay: baselines: the demonstrated path by other means, and the paper's energy
     episode: one task from the start to the settled end
     campaign: many episodes in several processes
     report: success, causes of failure, and the record of a run
+    published: published success rates, and which rows stand beside them
+    comparison: rows of many campaigns beside published ones, as a page and a record
     recording: pictures and films of a cell
 """

