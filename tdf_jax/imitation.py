@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import host
 from tdf_jax._internal.deprecation import caller_level, renamed_keywords
-from tdf_jax._internal.errors import CategoryWarning, ConfidenceWarning, InputError
+from tdf_jax._internal.errors import ConfidenceWarning, InputError
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference
 from tdf_jax.geometry.demonstration import Demonstration
@@ -24,10 +24,8 @@ from tdf_jax.solvers.initial import default_goal
 from tdf_jax.solvers.multistart import SolveConfig, solve
 from tdf_jax.solvers.pick import CarryConfig, carry
 from tdf_jax.solvers.result import Result
-from tdf_jax.uncertainty.calibration import CALIBRATED, CURVES, TARGET_CURVES, confidence, recognition, surface_logit
-
-# Probability of the demonstration's category, or of a right pick, below which a warning is issued.
-DOUBT = 0.5
+from tdf_jax.uncertainty.calibration import CALIBRATED, CURVES, confidence, recognition, surface_logit
+from tdf_jax.uncertainty.doubt import DOUBT, warn_of_category, warn_of_target
 
 
 @host
@@ -116,7 +114,8 @@ def imitate(
         search = {"config": config, "seat": seat, "progress": progress, "device_mesh": device_mesh}
         result = carry_object(objects, reference, key, **search)
         if target_points is not None:
-            _check_target(result, model if target_model is None else target_model, objects)
+            weights = (model if target_model is None else target_model).info.name
+            warn_of_target("imitate()", float(result.target_residual), weights, objects.target, target_points)
         return _judged(result, model.info.name, field, points)
     goal = None if goal is None else jnp.asarray(checks.pose("imitate()", "goal", goal), float)
     if goal_offset is not None:
@@ -132,25 +131,6 @@ def imitate(
     return solve(field, reference, key, energy=weights, config=config, **settings)
 
 
-def _check_target(result: Result, model: Model, objects: Objects) -> None:
-    """Warn of a target of another category than the demonstration's, where that is known for the weights."""
-    if model.info.name not in TARGET_CURVES or objects.target is None or objects.target_points is None:
-        return
-    curve, logit = TARGET_CURVES[model.info.name], surface_logit(objects.target, jnp.asarray(objects.target_points))
-    recognised = recognition(float(result.target_residual), logit, curve)
-    _warn_of_category("target", recognised, model.info.name, "target_points, their unit and target_model")
-
-
-def _warn_of_category(what: str, recognised: float | None, weights: str, check: str) -> None:
-    if recognised is not None and recognised < DOUBT:
-        warnings.warn(
-            f"imitate(): the {what} does not look like one of the demonstration's category to the weights "
-            f"{weights!r} (probability {recognised:.2g}); check {check}",
-            CategoryWarning,
-            stacklevel=caller_level(),
-        )
-
-
 def _judged(result: Result, weights: str, field, points) -> Result:
     """The result with the probabilities that shipped weights are calibrated for; NaN where they are not."""
     recognised = confident = None
@@ -158,7 +138,7 @@ def _judged(result: Result, weights: str, field, points) -> Result:
         recognised = recognition(float(result.residual), surface_logit(field, points), CURVES[weights])
     if weights in CALIBRATED:
         confident = confidence(float(result.residual))
-    _warn_of_category("object", recognised, weights, "points, their unit and the weights")
+    warn_of_category("imitate()", "object", recognised, weights, "points, their unit and the weights")
     if confident is not None and confident < DOUBT and (recognised is None or recognised >= DOUBT):
         warnings.warn(
             f"imitate(): the pick is right with a probability of {confident:.2g} only. Check that the cloud shows the "

@@ -23,7 +23,7 @@ from tdf_jax.energy.residual import pick_residual
 from tdf_jax.energy.seating import touch_distance
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration, check_apart
-from tdf_jax.geometry.registration import region_distance, register_region
+from tdf_jax.geometry.registration import refine_regions
 from tdf_jax.geometry.trajectory import Trajectory, resample
 from tdf_jax.geometry.transport import arrival_depth, carry_to_target
 from tdf_jax.networks.encoding import encode
@@ -32,6 +32,7 @@ from tdf_jax.networks.model import Model
 from tdf_jax.solvers.multistart import solve
 from tdf_jax.solvers.pick import CarryConfig, carry
 from tdf_jax.solvers.result import Result, with_ends
+from tdf_jax.uncertainty.doubt import warn_of_target
 from tdf_jax.uncertainty.modes import cluster_poses
 
 # Folded into the key, so that the pick is the same with and without a target. The numbers are arbitrary, but fixed:
@@ -45,10 +46,6 @@ MAX_TOUCH_DISTANCE = 0.01
 # Half edge of the region that is registered, a factor on the spread of the contact points along an axis: of points in a
 # box, 0.8 of its edge.
 REGION = 1.4
-# What a registration must bring the distance of the clouds in the region to: a factor on what it was, and a factor on
-# the half edge. On development pairs these were 0.2 to 0.9 and 0.07 to 0.14 for the pegs of racks; for the rims of mugs
-# and the floors of containers, whose sizes differ, 0.6 to 1.5 and mostly 0.13 to 0.33.
-FITS_BETTER, FITS = 0.8, 0.12
 MAX_SOLUTIONS = 25  # candidates of a result: distinct picks times distinct motions of the object
 
 
@@ -131,6 +128,10 @@ def relate(
 
     Raises:
         InputError: bad clouds, or a demonstration without a target.
+
+    Warns:
+        CategoryWarning: the target is probably of another category than the demonstrated one, where that is known for
+            the weights.
     """
     checks.key("relate()", key)
     reference = reference_of("relate()", model, demonstration, target_points, target_model)
@@ -140,7 +141,10 @@ def relate(
     field = target_field(model, reference, target_points, target_model)
     objects = Objects(points, target_points, encode(model, points), field)
     check_scene("relate()", points, target_points, reference)  # after `encode`, which refuses what is no cloud
-    return find_relations("relate()", objects, reference, key, config, seat).motions[0]
+    found = find_relations("relate()", objects, reference, key, config, seat)
+    weights = (model if target_model is None else target_model).info.name
+    warn_of_target("relate()", found.target_residual, weights, field, target_points)
+    return found.motions[0]
 
 
 def reference_of(function: str, model: Model, demonstration, target_points, target_model: Model | None) -> Reference:
@@ -287,8 +291,7 @@ def _registered(
     """Contact poses on the target, refined by the points of both clouds in the region.
 
     Descriptors know where the region is, but little of its own shape: on a rack they give the height and the tilt of a
-    common peg rather than of this one. Where the two regions differ in size, as the rims of two mugs do, closest points
-    would tilt the pose and not fit better: then the pose stays.
+    common peg rather than of this one, or the side without a peg.
     """
     query = np.asarray(contact.query, float)
     T_contact_region = np.eye(4)  # the contact frame may be the world, far from its points
@@ -296,16 +299,13 @@ def _registered(
     radius = REGION * float(np.sqrt(np.mean((query - query.mean(axis=0)) ** 2)))
     T_region_world = np.linalg.inv(_matrix(contact.T_world_contact) @ T_contact_region)
     demonstrated = np.asarray(contact.target_points, float) @ T_region_world[:3, :3].T + T_region_world[:3, 3]
+    given = np.stack([_matrix(pose) @ T_contact_region for pose in contacts])
+    refined = refine_regions(demonstrated, points, given, radius)
     back = np.linalg.inv(T_contact_region)
-    poses = []
-    for pose in contacts:
-        start = _matrix(pose) @ T_contact_region
-        T = register_region(demonstrated, points, start, radius)
-        before, after = (region_distance(demonstrated, points, one, radius) for one in (start, T))
-        if after < min(FITS_BETTER * before, FITS * radius):
-            T = T @ back
-            pose = np.asarray(se3.pose(T[:3, :3], T[:3, 3]))
-        poses.append(pose)
+    poses = [
+        pose if (T == start).all() else np.asarray(se3.pose((T @ back)[:3, :3], (T @ back)[:3, 3]))
+        for pose, start, T in zip(contacts, given, refined, strict=True)
+    ]
     return np.stack(poses).astype(contacts.dtype)
 
 

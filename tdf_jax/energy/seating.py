@@ -1,4 +1,9 @@
-"""Seating: how far an object is lowered or raised until it touches its target, by the occupancies of both."""
+"""Seating: how far an object is lowered or raised until it touches its target, by the occupancies of both.
+
+The level of a half of a field is up to some millimetres off the surface, more so at thin parts. The cloud says where
+the surface is: so a point touches an object where its occupancy reaches what the field has at the nearest points of
+the object's cloud.
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,14 +14,20 @@ from tdf_jax.networks.field import DescriptorField
 
 REACH = 0.015  # metres; an object that touches nothing within it is not moved
 STEPS = 15  # tested displacements each way; between them the occupancy is interpolated
-OCCUPIED = 0.5  # occupancy that counts as touching
-RANK = 2  # the touch is that of the second point, so that one wrong value does not decide
+LEVEL_POINTS = 4  # nearest points of a cloud, by which the occupancy at its surface is known
+SEEN = 0.012  # metres from the cloud within which its points say where the surface is
+UNSEEN_LEVEL = 0.5  # occupancy that counts as touching elsewhere
+# Limits of the occupancy that counts as touching. In the target's field, where the object's points are tested, only
+# what is clearly inside counts: those of racks have shadows of a half beside their pegs.
+OBJECT_LEVELS, TARGET_LEVELS = (0.1, 0.9), (0.7, 0.95)
 NEIGHBOURS = 4  # points half way to the nearest neighbours are tested too: few points of a cloud are on a thin peg
 BESIDE = 0.01  # metres across the direction within which a point may meet the other object
 SIDEWAYS = 2.0  # weight of the distance across the direction when those points are chosen
 POINTS = 512  # points of each object that are tested
 CLOUD = 2000  # points of each cloud that are looked at; more cost time and memory
-PADDING = 128  # the points are filled up to a multiple of it, so that few programs are compiled
+CLOSEST = 1e-4  # metres; nearer points weigh no more
+TINY = 1e-4  # occupancies are this far from 0 and 1 at least
+PADDING = 2048  # the points are filled up to a multiple of it, so that few programs are compiled
 
 
 def touch_distance(
@@ -29,8 +40,7 @@ def touch_distance(
 ) -> float:
     """How far along a direction a placed object touches its target.
 
-    The object and the target touch where points of the cloud of one have an occupancy of a half in the field of the
-    other.
+    The object and the target touch where points of the cloud of one are on the surface of the other.
 
     Args:
         field: field of the object in its initial pose.
@@ -53,10 +63,11 @@ def touch_distance(
         return np.nan
     steps = np.linspace(-REACH, REACH, 2 * STEPS + 1)
     shifts = steps[:, None, None] * direction
-    occupied = [_ranked_occupancy(field, (target_near - shifts - t) @ R)]
+    cloud = _thinned(np.asarray(points, float))
+    depths = [_depth(field, cloud, (target_near - shifts - t) @ R, OBJECT_LEVELS)]
     if target is not None:
-        occupied.append(_ranked_occupancy(target, near + shifts))
-    return _first_touch(steps, np.max(occupied, axis=0))
+        depths.append(_depth(target, _thinned(target_points), near + shifts, TARGET_LEVELS))
+    return _first_touch(steps, np.max(depths, axis=0))
 
 
 def _thinned(points: np.ndarray) -> np.ndarray:
@@ -103,19 +114,47 @@ def _closest(count: int, index: np.ndarray, measures: np.ndarray) -> np.ndarray:
     return np.argsort(least, kind="stable")[: min(POINTS // 2, int(np.isfinite(least).sum()))]
 
 
-def _ranked_occupancy(field: DescriptorField, x: Float[np.ndarray, "steps count 3"]) -> Float[np.ndarray, " steps"]:
-    """The occupancy of the `RANK`-th point at every displacement."""
+def _depth(
+    field: DescriptorField,
+    cloud: Float[np.ndarray, "points 3"],
+    x: Float[np.ndarray, "steps count 3"],
+    levels: tuple[float, float],
+) -> Float[np.ndarray, " steps"]:
+    """How far the deepest point is inside an object at every displacement, as a difference of logits.
+
+    Args:
+        field: field of the object.
+        cloud: cloud of the object, where its field is.
+        x: points at all displacements.
+        levels: lowest and highest occupancy that counts as touching.
+    """
+    from scipy.spatial import KDTree
+
     steps, count, _ = x.shape
-    padded = np.zeros((steps, -(-count // PADDING) * PADDING, 3), np.float32)
-    padded[:, :count] = x
-    occupancy = np.asarray(field.occupancy(jnp.asarray(padded.reshape(-1, 3)))).reshape(steps, -1)[:, :count]
-    return np.sort(occupancy, axis=1)[:, -min(RANK, count)]
+    distances, nearest = KDTree(cloud).query(x.reshape(-1, 3), min(LEVEL_POINTS, len(cloud)))
+    distances, nearest = distances.reshape(steps * count, -1), nearest.reshape(steps * count, -1)
+    weights = 1 / np.maximum(distances, CLOSEST) ** 2
+    own = (weights * _occupancy(field, cloud)[nearest]).sum(axis=1) / weights.sum(axis=1)
+    level = np.clip(np.where(distances[:, 0] < SEEN, own, UNSEEN_LEVEL), *levels)
+    depths = _logit(_occupancy(field, x.reshape(-1, 3))) - _logit(level)
+    return depths.reshape(steps, count).max(axis=1)
 
 
-def _first_touch(steps: np.ndarray, occupied: np.ndarray) -> float:
-    """Where the occupancy crosses a half: on the way down if the middle is free, on the way up if it is not."""
+def _occupancy(field: DescriptorField, x: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points"]:
+    padded = np.zeros((-(-len(x) // PADDING) * PADDING, 3), np.float32)
+    padded[: len(x)] = x
+    return np.asarray(field.occupancy(jnp.asarray(padded)), float)[: len(x)]
+
+
+def _logit(occupancy: np.ndarray) -> np.ndarray:
+    occupancy = np.clip(occupancy, TINY, 1 - TINY)
+    return np.log(occupancy / (1 - occupancy))
+
+
+def _first_touch(steps: np.ndarray, depths: np.ndarray) -> float:
+    """Where the depth crosses zero: on the way down if the middle is free, on the way up if it is not."""
     middle = len(steps) // 2
-    touches = occupied > OCCUPIED
+    touches = depths > 0
     if touches[middle]:
         free = np.flatnonzero(~touches[:middle])
         low = free[-1] if len(free) else None
@@ -124,5 +163,5 @@ def _first_touch(steps: np.ndarray, occupied: np.ndarray) -> float:
         low = middle + hit[0] - 1 if len(hit) else None
     if low is None:
         return np.nan
-    share = (OCCUPIED - occupied[low]) / (occupied[low + 1] - occupied[low])
+    share = -depths[low] / (depths[low + 1] - depths[low])
     return float(steps[low] + share * (steps[low + 1] - steps[low]))

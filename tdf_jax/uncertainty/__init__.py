@@ -3,5 +3,6 @@
 Modules:
     calibration: confidence and recognition as logistic curves, their fit and their reliability
     covariance: curvature, covariance and free directions of a pose
+    doubt: warnings of objects and targets of another category
     modes: distinct poses among the candidates
 """
