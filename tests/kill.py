@@ -259,13 +259,17 @@ def run_through(folder: Path, name: str, expected, first: float, last: float, rn
         for path in (place / "out").iterdir():
             os.utime(path, (EARLIER, EARLIER))
     kills, problems, parts = [], [], {}
-    for _ in range(rng.integers(2, 6)):
+    finishes = rng.random() < 0.5  # the first kill comes with the first finished part, however fast the machine is
+    for number_of_kill in range(rng.integers(2, 6)):
         # Most kills come after the first change of a file, however busy the machine is.
         wait, delay = (0.0, rng.uniform(0, first)) if rng.random() < 0.15 else (HANG, rng.uniform(0, last - first))
-        before = changes(place)
+        state = changes
+        if finishes and number_of_kill == 0:
+            state, wait, delay = command.parts, HANG, 0.0
+        before = state(place)
         with started(folder, place, command.words) as run:
             began = time.monotonic()
-            while time.monotonic() - began < wait and run.poll() is None and changes(place) == before:
+            while time.monotonic() - began < wait and run.poll() is None and state(place) == before:
                 time.sleep(0.01)
             try:
                 run.wait(delay)

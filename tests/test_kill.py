@@ -21,12 +21,12 @@ def test_killed_commands_lose_nothing_and_end_as_undisturbed_ones(tmp_path, monk
         monkeypatch.setitem(kill.COMMANDS, name, dataclasses.replace(kill.COMMANDS[name], words=words))
     for variable, value in quick_environment().items():
         monkeypatch.setenv(variable, value)
-    records = kill.campaign(tmp_path, kills=3, seed=11, commands=names)  # two in the first run-through
+    records = kill.campaign(tmp_path, kills=3, seed=3, commands=names)  # two in the first run-through
     assert [record["problems"] for record in records] == [[]] * len(records)
     assert {record["command"] for record in records} == set(names)
     assert sum(len(record["kills"]) for record in records) >= 3
     assert any(kill["parts"] for record in records for kill in record["kills"])
-    assert kill.campaign(tmp_path, kills=3, seed=11, commands=names) == records  # which are kept
+    assert kill.campaign(tmp_path, kills=3, seed=3, commands=names) == records  # which are kept
 
 
 def test_half_written_files_are_found(tmp_path):
