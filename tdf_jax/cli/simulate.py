@@ -20,7 +20,7 @@ def simulate(
     demonstrations: int = 1,
     seed: int = 0,
     clouds: Literal["full", "views3", "views1"] = "full",
-    method: Literal["tdf_jax", "uncentred", "truth", "rigid replay", "ICP"] = "tdf_jax",
+    method: Literal["tdf_jax", "uncentred", "truth", "rigid replay", "ICP", "even blending", "paper"] = "tdf_jax",
     light: bool = False,
     object_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
     target_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
@@ -47,8 +47,11 @@ def simulate(
         demonstrations: 1, each that of a tenth of the episodes, or 10.
         seed: seed of objects, starts and searches.
         clouds: complete clouds, or what three depth cameras or one see.
-        method: tdf_jax; uncentred, without centring the grasp on the cloud; the truth; or a baseline: the demonstrated
-            path moved with the clouds' centroids, or by ICP.
+        method: tdf_jax; uncentred, without centring the grasp on the cloud; the truth; or a baseline. Rigid replay and
+            ICP move the demonstrated pick and goal with the clouds. Even blending has our pick and our goal, joined by
+            the demonstrated path blended evenly over its poses. The paper's method minimises its energy (k = 0.02)
+            over all poses but the last; it is given our goal of the same episode. All but uncentred and the truth have
+            their grasps centred.
         light: objects of 0.01 kg, as in NDF and R-NDF, instead of 0.10 to 0.40 kg by volume.
         object_weights: weights of the object.
         target_weights: weights of the target.
@@ -63,7 +66,7 @@ def simulate(
     from tdf_jax._internal.errors import InputError
     from tdf_jax.evaluation.records import write_record
     from tdf_jax.networks.checkpoint import load_model
-    from tdf_jax.sim.campaign import Condition, Settings, check_condition, film, run_campaign
+    from tdf_jax.sim.campaign import NETWORKS, Condition, Settings, check_condition, film, run_campaign
     from tdf_jax.sim.physics import LIGHT_MASS, extra
     from tdf_jax.sim.recording import ENDINGS, check_film
     from tdf_jax.sim.report import record, summary
@@ -92,7 +95,7 @@ def simulate(
     check_condition(condition)
     if target_weights is None:
         target_weights = _shipped(TASKS[task].target)
-    if target == "found" and target_weights is None and method in ("tdf_jax", "uncentred"):
+    if target == "found" and target_weights is None and method in NETWORKS:
         raise InputError(
             f"tdf simulate: there are no shipped weights of a {TASKS[task].target}; expected --target known, or "
             "--target-weights FILE of a network from tdf train"

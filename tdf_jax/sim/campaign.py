@@ -24,16 +24,19 @@ from tdf_jax.sim.tasks import POSES, TASKS
 
 if TYPE_CHECKING:
     from tdf_jax.energy.reference import Reference
+    from tdf_jax.sim.replay import Replay
     from tdf_jax.sim.robot import Robot
 
 FORMAT = 3  # format number; raise it when what an episode computes changes
+REVISIONS = {"rigid replay": 1, "ICP": 1}  # changes of what a single method computes
 DEMONSTRATIONS = 10  # episodes that demonstrate; with one demonstration, each is that of a tenth of the episodes
 FIRST_DEMONSTRATION = 1_000_000  # their numbers begin here, so that no episode shares their objects
 CLOUDS = ("full", "views3", "views1")
 TARGETS = ("known", "found")
 LIBRARY, UNCENTRED, TRUTH, REPLAY, ICP = "tdf_jax", "uncentred", "truth", "rigid replay", "ICP"
-METHODS = (LIBRARY, UNCENTRED, TRUTH, REPLAY, ICP)
-ICP_STARTS = 10
+EVEN, PAPER = "even blending", "paper"
+METHODS = (LIBRARY, UNCENTRED, TRUTH, REPLAY, ICP, EVEN, PAPER)
+NETWORKS = (LIBRARY, UNCENTRED, EVEN, PAPER)  # those that imitate by the networks
 POINTS = 1500  # of a complete cloud
 VIEWED = 4000  # most points of a cloud of cameras: the field takes a subsample
 
@@ -191,6 +194,7 @@ def run_one(settings: Settings, number: int) -> Run:
     condition = settings.condition
     bench = _bench(settings)
     about = [FORMAT, version("tdf_jax"), *bench.fingerprints, *bench.robot_content, *condition, settings.seed, number]
+    about += [REVISIONS[condition.method]] if condition.method in REVISIONS else []
     result = kept("tdf simulate", settings.folder, about, functools.partial(bench.run, number))
     fields = {field.name: result[field.name].item() for field in dataclasses.fields(Outcome)}
     seconds = (float(result["seconds"][0]), float(result["seconds"][1]))
@@ -274,6 +278,7 @@ class _Bench:
         self.robot_content = [] if settings.robot is None else [digest(settings.robot.read_bytes()), settings.site]
         self._shown: dict[int, tuple] = {}
         self._described: dict[int, Reference] = {}
+        self._paper: dict[int, Reference] = {}
 
     def shown(self, number: int):
         """The demonstrated episode and the demonstration."""
@@ -295,6 +300,14 @@ class _Bench:
             demonstrations = [self.shown(one)[1] for one in several]
             self._described[number] = describe(self.model, demonstrations, target_model=self.target_model)
         return self._described[number]
+
+    def paper_reference(self, number: int) -> "Reference":
+        """The descriptors of a demonstration for the paper's method."""
+        from tdf_jax.sim.replay import describe_without_target
+
+        if number not in self._paper:
+            self._paper[number] = describe_without_target(self.model, self.shown(number)[1])
+        return self._paper[number]
 
     def episode(self, number: int):
         """An episode, and the number of the demonstration that it imitates; -1 for all of them."""
@@ -338,7 +351,7 @@ class _Bench:
 
     def found(self, episode, shown: int) -> tuple[Sequence[np.ndarray], np.ndarray] | Outcome:
         """What is imitated in an episode; its outcome if nothing is found, or no camera sees one of the bodies."""
-        if self.condition.method in (LIBRARY, UNCENTRED):
+        if self.condition.method in NETWORKS:
             self.reference(shown)  # what is wrong with the weights is no failure of an episode, and ends the campaign
         try:
             return self.imitated(episode, shown)
@@ -359,8 +372,8 @@ class _Bench:
             path = demonstrate_episode(episode, self.settings.seed).trajectory
             return [np.asarray(path.matrices, float)], true
         points, target_points = self.clouds(episode)
-        found = self.library if condition.method in (LIBRARY, UNCENTRED) else self.baseline
-        paths, motion = found(episode.number, points, None if condition.target == "known" else target_points, shown)
+        known = condition.target == "known"
+        paths, motion = self.replay(episode.number, points, None if known else target_points, shown)
         if condition.method != UNCENTRED:
             paths = [centred_path(path, points, episode.grip.opening, self.robot) for path in paths]
         return paths, motion
@@ -392,65 +405,30 @@ class _Bench:
             clouds.append(seen[np.sort(chosen)].astype(np.float32))
         return clouds[0], clouds[1]
 
-    def library(self, number: int, points, target_points, shown: int):
-        """What `tdf_jax.imitate` finds."""
+    def replay(self, number: int, points, target_points, shown: int) -> "Replay":
+        """What a method finds by the clouds."""
         import jax
-        import jax.numpy as jnp
 
-        from tdf_jax.geometry.trajectory import Trajectory
         from tdf_jax.imitation import imitate
+        from tdf_jax.sim import replay
 
+        method = self.condition.method
+        key = jax.random.fold_in(jax.random.key(self.settings.seed), number)
+        if method == REPLAY:
+            return replay.replay_by_centroids(self.shown(shown)[1], points, target_points)
+        if method == ICP:
+            return replay.replay_by_registration(self.shown(shown)[1], points, target_points, key=key)
         result = imitate(
             self.model,
             self.reference(shown),
             points,
             target_points=target_points,
             target_model=self.target_model,
-            key=jax.random.fold_in(jax.random.key(self.settings.seed), number),
+            key=key,
         )
-        finite = np.asarray(result.finite)
-        order = [row for row in np.argsort(np.asarray(result.energies), kind="stable") if finite[row]]
-        if not order:
-            raise InputError(f"imitate(): no candidate is finite: {result.status}")
-        paths = [np.asarray(Trajectory(jnp.asarray(result.trajectories[row])).matrices, float) for row in order]
-        motion = np.asarray(Trajectory(result.object_motion[None]).matrices[0], float)
-        return paths, motion
-
-    def baseline(self, number: int, points, target_points, shown: int):
-        """The demonstrated path, moved rigidly: with the centroid of the cloud, or by ICP of the clouds."""
-        import jax
-
-        from tdf_jax.evaluation.baselines import iterative_closest_points
-        from tdf_jax.geometry import se3
-        from tdf_jax.geometry.trajectory import Trajectory
-
-        demonstration = self.shown(shown)[1]
-        target = demonstration.target
-        path = np.asarray(demonstration.trajectory.matrices, float)
-        before, before_target = np.asarray(demonstration.points, float), np.asarray(target.points, float)
-        moved = np.asarray(Trajectory(demonstration.object_motion[None]).matrices[0], float)
-        of_object, of_target = np.eye(4), np.eye(4)
-        if self.condition.method == REPLAY:
-            of_object[:3, 3] = points.mean(axis=0) - before.mean(axis=0)
-            if target_points is not None:
-                of_target[:3, 3] = target_points.mean(axis=0) - before_target.mean(axis=0)
-        else:
-            key = jax.random.fold_in(jax.random.key(self.settings.seed), number)
-            rotations = np.asarray(se3.uniform_rotations(key, ICP_STARTS), float)
-            of_object = iterative_closest_points(before, points, rotations)
-            if target_points is not None:
-                of_target = iterative_closest_points(before_target, target_points, rotations)
-        motion = of_target @ moved @ np.linalg.inv(of_object)
-        # The ends move with object and target; in between, the demonstrated path blends evenly from one to the other.
-        shares = np.linspace(0, 1, len(path))
-        from scipy.spatial.transform import Rotation, Slerp
-
-        ends = of_object @ path[0], motion @ of_object @ path[0]
-        first, last = ends[0] @ np.linalg.inv(path[0]), ends[1] @ np.linalg.inv(path[-1])
-        blend = Slerp([0, 1], Rotation.from_matrix(np.stack([first[:3, :3], last[:3, :3]])))(shares).as_matrix()
-        poses = np.tile(np.eye(4), (len(path), 1, 1))
-        poses[:, :3, :3] = blend @ path[:, :3, :3]
-        starts = path[:, :3, 3] @ first[:3, :3].T + first[:3, 3]
-        stops = path[:, :3, 3] @ last[:3, :3].T + last[:3, 3]
-        poses[:, :3, 3] = starts + shares[:, None] * (stops - starts)
-        return [poses], motion
+        if method == EVEN:
+            return replay.blend_evenly(self.shown(shown)[1], result)
+        found = replay.replay_candidates(result)
+        if method == PAPER:
+            return replay.replay_by_energy(self.model, self.paper_reference(shown), points, result.goal, key=key)
+        return found
