@@ -131,8 +131,11 @@ def test_a_target_of_another_category_is_warned_of(small_model, related, moved, 
     monkeypatch.setitem(TARGET_CURVES, "small", (-50.0, 0.0, 0.0))
     with pytest.warns(tdf.CategoryWarning, match="the target does not look like one .* check target_points"):
         tdf.imitate(small_model, reference, **options)
+    with pytest.warns(tdf.CategoryWarning, match=r"relate\(\): the target does not look like one"):
+        tdf.relate(small_model, reference, **options)
     monkeypatch.setitem(TARGET_CURVES, "small", (50.0, 0.0, 0.0))
     tdf.imitate(small_model, reference, **options)  # without a warning, which would be an error
+    tdf.relate(small_model, reference, **options)
 
 
 def test_a_shared_reference_gives_the_same(small_model, related, moved, result):

@@ -60,3 +60,17 @@ def test_what_does_not_touch_within_reach_is_not_seated(height):
 def test_what_is_beside_the_target_does_not_touch_it():
     aside = raised(0.004) + [0, 0, 0, 0, 0.3, 0, 0]
     assert np.isnan(touch_distance(BALL, FLOOR, sphere(), floor(), aside, DOWN))
+
+
+@pytest.mark.parametrize("bias", [0.002, -0.002])
+def test_a_field_that_is_too_fat_or_too_thin_is_read_by_its_cloud(bias):
+    ball = solid(lambda x: (RADIUS + bias - jnp.linalg.norm(x, axis=-1)) / 4)  # occupancies of 0.73 and 0.27
+    for target in (None, FLOOR):
+        found = touch_distance(ball, target, sphere(), floor(), raised(0.004), DOWN)
+        assert abs(found - 0.004) < 1e-3
+
+
+def test_a_shadow_in_the_field_of_the_target_is_not_touched():
+    shadow = solid(lambda x: jnp.where(x[..., 2] < 0, 1.0, jnp.where(x[..., 2] < 0.006, 2e-4, -1.0)))
+    assert np.asarray(shadow.occupancy(jnp.array([0, 0, 0.003]))) == pytest.approx(0.6, abs=0.01)
+    assert abs(touch_distance(BALL, shadow, sphere(), floor(), raised(0.004), DOWN) - 0.004) < 1e-3

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tdf_jax.geometry.registration import region_distance, register_region
+from tdf_jax.geometry.registration import refine_regions, region_distance, register_region
 
 
 def _peg(rng, count=400):
@@ -52,3 +52,41 @@ def test_the_distance_is_of_the_region_in_both_directions():
     beside[2, 3] = 0.1  # where the cloud has no points
     assert region_distance(cloud, cloud, beside, 0.04) == np.inf
     assert 0.001 < region_distance(cloud, cloud + [0.0, 0.02, 0.0], np.eye(4), 0.04) < 0.02
+
+
+def _poses(*translations):
+    poses = np.tile(np.eye(4), (len(translations), 1, 1))
+    poses[:, :3, 3] = translations
+    return poses
+
+
+def _cup(rng, radius, count=1500):
+    """Points on the wall and the floor of a cup whose opening is at z = 0."""
+    angle, depth = rng.uniform(0, 2 * np.pi, count), rng.uniform(-0.08, 0.0, count)
+    wall = np.stack([radius * np.cos(angle), radius * np.sin(angle), depth], axis=1)
+    return np.concatenate([wall, wall[:300] * [0.7, 0.7, 0] + [0, 0, -0.08]])
+
+
+def test_a_first_pose_beside_the_region_gives_way_to_one_that_fits():
+    rng = np.random.default_rng(3)
+    demonstrated, points = _peg(rng), _peg(rng)
+    given = _poses([0.0, 0.0, 0.045], [-0.02, 0.0, 0.3])  # no point near the second at all
+    assert region_distance(demonstrated, points, register_region(demonstrated, points, given[0], 0.04), 0.04) > 0.02
+    found = refine_regions(demonstrated, points, given, 0.04)
+    assert np.linalg.norm(found[0, :3, 3]) < 0.003
+    np.testing.assert_array_equal(found[1], given[1])
+
+
+def test_a_first_pose_that_fits_is_only_registered():
+    rng = np.random.default_rng(4)
+    demonstrated, points = _peg(rng), _peg(rng)
+    given = _poses([0.006, 0.0, 0.004], [0.0, 0.0, 0.0])
+    found = refine_regions(demonstrated, points, given, 0.04)
+    expected = register_region(demonstrated, points, given[0], 0.04)
+    np.testing.assert_array_equal(found[0], expected)
+
+
+def test_a_region_of_another_size_stays_where_it_is():
+    rng = np.random.default_rng(5)
+    given = _poses([0.0, 0.0, 0.0], [0.01, 0.0, 0.0])
+    np.testing.assert_array_equal(refine_regions(_cup(rng, 0.045), _cup(rng, 0.03), given, 0.04), given)
