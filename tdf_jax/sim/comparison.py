@@ -38,6 +38,7 @@ CHANGES = (
     ("clouds", "full", "views1", "Clouds of one camera instead of complete ones"),
     ("demonstrations", 1, 10, "Ten demonstrations instead of one"),
 )
+SAME_EPISODES = ("mode", "clouds", "demonstrations")  # fields that change neither objects nor starts
 CONDITIONS = ("target", "poses", "clouds", "shown", "method")  # columns that say what a row is measured under
 
 
@@ -211,7 +212,9 @@ def reading(rows: Sequence[Row]) -> list[str]:
     for field, before, after, words in CHANGES:
         pairs = _pairs(ours, field, before, after)
         if pairs:
-            lines.append(f"- {words}: overall success {_difference(pairs)}.")
+            masses = {(one.condition.mass, other.condition.mass) for one, other in pairs}
+            also = ", and objects of their natural mass" if any(a and not b for a, b in masses) else ""
+            lines.append(f"- {words}{also}: overall success {_difference(pairs, field in SAME_EPISODES)}.")
     methods = dict.fromkeys(row.condition.method for row in rows if row.condition.method != LIBRARY)
     for method in methods:
         pairs = _pairs(rows, "method", method, LIBRARY)
@@ -261,9 +264,8 @@ def _against_published(ours: Sequence[Row]) -> list[str]:
         if total:
             what = "place" if system == "R-NDF" else "overall"
             lines.append(
-                f"- {PAPERS[system]}, {what}, the most demonstrations: the published rate is below our interval in "
-                f"{counts['below']}, in it in {counts['in']} and above it in {counts['above']} of {total} rows. Same "
-                "protocol, other objects."
+                f"- {system}, {what}: the published rate is below our interval in {counts['below']}, in it in "
+                f"{counts['in']} and above it in {counts['above']} of {total} rows. Same protocol, other objects."
             )
     return lines
 
@@ -282,20 +284,28 @@ def _pairs(rows: Sequence[Row], field: str, before: Any, after: Any) -> list[tup
     return [(first[key(row)], row) for row in rows if getattr(row.condition, field) == after and key(row) in first]
 
 
-def _difference(pairs: Sequence[tuple[Row, Row]], rate: str = "overall") -> str:
-    """The change of a rate from the first to the second of each pair, in points, paired by episodes."""
+def _difference(pairs: Sequence[tuple[Row, Row]], same: bool = True) -> str:
+    """The change of the overall rate from the first to the second of each pair, in points, paired by numbers.
+
+    Args:
+        pairs: rows before and after.
+        same: whether episodes of one number have the same objects and starts in both.
+    """
     changes, objects = [], []
     for before, after in pairs:
-        first, second = before.values(rate), after.values(rate)
+        first, second = before.values("overall"), after.values("overall")
         for key in first:
             if key in second:
                 changes.append(second[key] - first[key])
                 objects.append(key)
     mean, interval = float(np.mean(changes)), bootstrap_interval(np.array(changes), objects)
-    words = "unchanged" if mean == 0 else f"{'higher' if mean > 0 else 'lower'} by {abs(100 * mean):.0f} points"
+    points = f"{abs(100 * mean):.0f}"
+    words = (
+        f"is {'higher' if mean > 0 else 'lower'} by {points} point{'s' * (points != '1')}" if mean else "is the same"
+    )
     span = "" if interval is None else f", 95 % interval {100 * interval[0]:+.0f} to {100 * interval[1]:+.0f}"
     count = len(pairs)
-    return f"is {words}{span} ({count} pair{'s' * (count > 1)} of rows, the same episodes)"
+    return f"{words}{span} ({count} pair{'s' * (count > 1)} of rows{', the same episodes' * same})"
 
 
 def _setup(rows: Sequence[Row], settings: Mapping[str, Any]) -> str:
@@ -319,7 +329,8 @@ def _setup(rows: Sequence[Row], settings: Mapping[str, Any]) -> str:
         "given. NDF and L-NDF reset the object to the predicted pose and test the grasp apart, with a target that "
         "stays where it was demonstrated. R-NDF finds the target and has no grasp, so its number is the **place**. "
         "None of them executes a trajectory by friction alone: nothing stands beside executed rows. *Shown* is the "
-        "number of demonstrations; with one, each of ten is imitated in a tenth of the episodes."
+        "number of demonstrations; with one, each of ten is imitated in a tenth of the episodes. "
+        "L-NDF's rates of bottles are approximate."
     )
 
 

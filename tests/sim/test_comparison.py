@@ -175,20 +175,35 @@ def test_the_reading_compares_rows_that_differ_in_one_thing(row):
         row(GOOD, GOOD, GOOD, GOOD, mode="execute", method="truth"),
     ]
     text = "\n".join(reading(rows))
-    assert "Executed instead of teleported: overall success is lower by 25 points" in text  # whatever the masses
+    assert (  # whatever the masses
+        "Executed instead of teleported, and objects of their natural mass: overall success is lower by 25 points"
+    ) in text
     assert "instead of upright: overall success is lower by 50 points" in text
     assert "The library instead of ICP: overall success is higher by 100 points, 95 % interval +100 to +100" in text
     assert "instead of the true pick and release: overall success is lower by 25 points" in text
     assert "(1 pair of rows, the same episodes)" in text
     assert "Causes of failure in 8 teleported episodes of the library: fell 2." in text
+    tilted = re.search("Starts tilted.*", text)
+    assert tilted and "(1 pair of rows)" in tilted[0]  # the starts are others
     assert "three cameras" not in text and "Ten demonstrations" not in text  # of which there are no rows
+
+
+def test_no_change_is_said_to_be_none_and_one_point_is_one(row):
+    same = [row(GOOD, FELL), row(GOOD, FELL, clouds="views3")]
+    assert "complete ones: overall success is the same, 95 % interval +0 to +0" in "\n".join(reading(same))
+    less = [row(*[GOOD] * 100), row(*[GOOD] * 99, FELL, clouds="views3")]
+    assert "overall success is lower by 1 point, 95 % interval -3 to +0" in "\n".join(reading(less))
 
 
 def test_the_reading_says_where_published_rates_lie(row):
     rows = [row(*[GOOD] * 5), row(*[FELL] * 5, poses="tilt60"), row(*[GOOD, GOOD, FELL] * 2, target="found")]
     text = "\n".join(reading(rows))
-    assert re.search(r"\[NDF\].*overall.*below our interval in 1, in it in 0 and above it in 1 of 2 rows", text)
-    assert re.search(r"\[R-NDF\].*place.*below our interval in 0, in it in 1 and above it in 0 of 1 rows", text)
+    assert re.search(
+        r"- NDF, overall: the published rate is below our interval in 1, in it in 0 and above it in 1 of 2 rows", text
+    )
+    assert re.search(
+        r"- R-NDF, place: the published rate is below our interval in 0, in it in 1 and above it in 0 of 1 rows", text
+    )
 
 
 def test_few_episodes_are_said_to_be_few(row):
