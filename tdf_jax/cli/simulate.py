@@ -68,7 +68,7 @@ def simulate(
     from tdf_jax._internal.errors import InputError
     from tdf_jax.evaluation.records import write_record
     from tdf_jax.networks.checkpoint import load_model
-    from tdf_jax.sim.campaign import NETWORKS, Condition, Settings, check_condition, film, run_campaign
+    from tdf_jax.sim.campaign import NETWORKS, Condition, Settings, check_condition, check_counts, film, run_campaign
     from tdf_jax.sim.physics import LIGHT_MASS, extra
     from tdf_jax.sim.recording import ENDINGS, check_film
     from tdf_jax.sim.report import record, summary
@@ -76,10 +76,7 @@ def simulate(
     from tdf_jax.sim.tasks import TASKS
     from tdf_jax.sim.viewer import check_display
 
-    if episodes < 1:
-        raise InputError(f"tdf simulate: --episodes is {episodes}; expected at least 1")
-    if processes is not None and processes < 1:
-        raise InputError(f"tdf simulate: --processes is {processes}; expected at least 1")
+    check_counts("tdf simulate", episodes, processes, "--")
     checks.seed("tdf simulate", seed, "--seed")
     if video is not None and mode != "execute":
         raise InputError("tdf simulate: --video is of executed episodes; expected --mode execute")

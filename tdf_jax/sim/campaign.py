@@ -31,6 +31,7 @@ FORMAT = 3  # format number; raise it when what an episode computes changes
 REVISIONS = {"rigid replay": 1, "ICP": 1}  # changes of what a single method computes
 DEMONSTRATIONS = 10  # episodes that demonstrate; with one demonstration, each is that of a tenth of the episodes
 FIRST_DEMONSTRATION = 1_000_000  # their numbers begin here, so that no episode shares their objects
+MOST_PROCESSES = 1024  # more are a mistake
 CLOUDS = ("full", "views3", "views1")
 TARGETS = ("known", "found")
 LIBRARY, UNCENTRED, TRUTH, REPLAY, ICP = "tdf_jax", "uncentred", "truth", "rigid replay", "ICP"
@@ -131,6 +132,20 @@ def check_condition(condition: Condition) -> None:
         raise InputError(f"{function}: {condition.method} has one demonstration; expected --demonstrations 1")
 
 
+def check_counts(function: str, episodes: int, processes: int | None, dashes: str) -> None:
+    """Raise InputError unless so many episodes can run in so many processes.
+
+    Args:
+        function: begins the message.
+        episodes: number of episodes.
+        processes: number of processes; None for one for every core.
+        dashes: what stands before both names in the message.
+    """
+    checks.count(function, f"{dashes}episodes", episodes, 1, FIRST_DEMONSTRATION)
+    if processes is not None:
+        checks.count(function, f"{dashes}processes", processes, 1, MOST_PROCESSES)
+
+
 def run_campaign(
     settings: Settings, episodes: int, processes: int | None = None, progress: bool = True, view: bool = False
 ) -> Iterator[Run]:
@@ -147,8 +162,12 @@ def run_campaign(
 
     Yields:
         The episodes, in order.
+
+    Raises:
+        InputError: the condition cannot be measured, or a number is out of range.
     """
     check_condition(settings.condition)
+    check_counts("run_campaign()", episodes, processes, "")
     count = min(episodes, processes or len(os.sched_getaffinity(0)))
     bar = tqdm(
         total=episodes,

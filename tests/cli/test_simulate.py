@@ -34,7 +34,9 @@ def refusal(tmp_path, capsys, monkeypatch):
     ("words", "message"),
     [
         (["--episodes", 0], "--episodes is 0; expected"),
+        (["--episodes", 2**70], "--episodes is 1180591620717411303424; expected a whole number from 1 to 1000000"),
         (["--processes", 0], "--processes is 0; expected"),
+        (["--processes", 2**70], "--processes is 1180591620717411303424; expected a whole number from 1 to 1024"),
         (["--seed", -1], "--seed is -1; expected"),
         (["--seed", 2**70], "--seed is 1180591620717411303424; expected"),
         (["--mode", "teleport", "--video", "film.gif"], "--video is of executed episodes; expected --mode execute"),

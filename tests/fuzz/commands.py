@@ -73,10 +73,14 @@ COMMANDS = {
     "benchmark": ["benchmark", "--weights", "w.safetensors", "--pairs", "1", "--seed", "1", "--num-starts", "1",
     "--out", "out"],
     "reproduce": ["reproduce", "fig1", "--weights", "w.safetensors", "--fast", "--out", "out"],
+    "simulate": [
+        "simulate", "--task", "bowl_on_shelf", "--method", "truth", "--mode", "teleport", "--episodes", "1", "--seed",
+        "3", "--demonstrations", "1", "--processes", "1", "--json", "out.json", "--out", "out",
+    ],
 }  # fmt: skip
 # Those whose undamaged form is quick; of the others only what is refused is tried.
 QUICK = ("imitate", "adam", "demonstrate", "landscape", "convert", "dataset", "shapes")
-RESUMED = ("dataset", "train", "benchmark", "reproduce")  # what they finished stays if they fail
+RESUMED = ("dataset", "train", "benchmark", "reproduce", "simulate")  # what they finished stays if they fail
 OUTPUTS = ("out", "out.npz", "out.safetensors", "out.png", "out.json")
 
 

@@ -1,6 +1,7 @@
 """The campaign of hostile inputs: a few cheap cases, many with all tests; and the judge sees each kind of fault."""
 
 import os
+import re
 import time
 import warnings
 
@@ -8,8 +9,9 @@ import numpy as np
 import pytest
 
 import tdf_jax as tdf
+from tdf_jax.cli.main import COMMANDS as NAMES, main
 
-from . import campaign, cases, files
+from . import campaign, cases, commands, files
 from .cases import BAD, ONLY_REFUSED, ONLY_RIGHT, REFUSED, RIGHT, WARNED, Case, judge
 from .undamaged import World
 
@@ -51,6 +53,26 @@ def test_a_case_depends_on_seed_and_number_only(world, tmp_path):
         case = files.damaged_case(np.random.default_rng(seed), world, tmp_path / folder, files.cloud_reader)
         texts.append((case.text, *(path.read_bytes() for path in (tmp_path / folder).iterdir())))
     assert texts[0] == texts[1] and len(set(texts)) == 3
+
+
+def test_every_command_is_tried():
+    assert {words[0] for words in commands.COMMANDS.values()} == set(NAMES)
+
+
+@pytest.mark.parametrize("number", range(12))
+def test_hostile_numbers_of_a_simulation_are_refused(tmp_path, monkeypatch, capsys, number):
+    """As in a child of the campaign, which asks for a refusal without a file."""
+    rng = np.random.default_rng([2, number])
+    words, expected = list(commands.COMMANDS["simulate"]), None
+    while expected is not ONLY_REFUSED:
+        words = list(commands.COMMANDS["simulate"])
+        _, expected = commands._hostile_number(rng, words)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tdf_jax.sim.campaign.run_campaign", lambda *about, **options: pytest.fail("it runs"))
+    with pytest.raises(SystemExit) as stop:
+        main(words)
+    assert stop.value.code == 2 and list(tmp_path.iterdir()) == []
+    assert re.search(r"tdf: \S|error|invalid", capsys.readouterr().err)
 
 
 # The judge
