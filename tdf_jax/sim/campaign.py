@@ -4,6 +4,7 @@ import concurrent.futures
 import contextlib
 import dataclasses
 import functools
+import math
 import multiprocessing
 import os
 import time
@@ -75,7 +76,9 @@ class Run:
         number: number of the episode.
         outcome: what became of it.
         rejected, redrawn: starts and pairs drawn before it; see `tdf_jax.sim.tasks.Episode`.
-        seconds: times of imitation and physics, with what each compiled; they differ from run to run.
+        seconds: times of the imitation, and of planning and physics together, with what each compiled; they differ
+            from run to run.
+        planning: time of the planning alone; NaN if it is not known, in an outcome that an earlier version kept.
     """
 
     condition: Condition
@@ -84,6 +87,7 @@ class Run:
     rejected: int
     redrawn: int
     seconds: tuple[float, float]
+    planning: float = math.nan
 
 
 @dataclasses.dataclass(frozen=True)
@@ -222,8 +226,9 @@ def run_one(settings: Settings, number: int, view: bool = False) -> Run:
         run = lambda: shown  # noqa: E731
     result = kept("tdf simulate", settings.folder, about, run)
     fields = {field.name: result[field.name].item() for field in dataclasses.fields(Outcome)}
-    seconds = (float(result["seconds"][0]), float(result["seconds"][1]))
-    return Run(condition, number, Outcome(**fields), int(result["rejected"]), int(result["redrawn"]), seconds)
+    imitation, executed, *planning = map(float, result["seconds"])
+    drawn = int(result["rejected"]), int(result["redrawn"])
+    return Run(condition, number, Outcome(**fields), *drawn, (imitation, executed), *planning)
 
 
 def film(settings: Settings, number: int, path: Path) -> Outcome:
@@ -367,15 +372,20 @@ class _Bench:
         episode, shown = self.episode(number)
         began = time.perf_counter()
         found = self.found(episode, shown)
-        imitated = time.perf_counter()
+        imitated = planned = time.perf_counter()
+
+        def plan_ends():
+            nonlocal planned
+            planned = time.perf_counter()
+
         if isinstance(found, Outcome):
             outcome = found
         elif condition.mode == "execute":
             with _watched(Viewer) as (watch, _):
-                outcome = run_episode(episode, self.robot, found[0], watch=watch if view else None)
+                outcome = run_episode(episode, self.robot, found[0], watch=watch if view else None, planned=plan_ends)
         else:
             outcome = teleport(episode, self.robot, found[0][0][0], found[1])
-        seconds = imitated - began, time.perf_counter() - imitated
+        seconds = imitated - began, time.perf_counter() - imitated, planned - imitated
         return {
             **dataclasses.asdict(outcome),
             "rejected": episode.rejected,

@@ -1,7 +1,7 @@
 """Episodes: one task from the start to the settled end, executed by the arm or with the object reset to its goal."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -125,6 +125,7 @@ def run_episode(
     candidates: Sequence[Float[np.ndarray, "poses 4 4"]],
     seed: int = 1,
     watch=None,
+    planned: Callable[[], None] | None = None,
 ) -> Outcome:
     """Execute the first trajectory that can be planned, from home to home, and look where the object ended.
 
@@ -134,6 +135,7 @@ def run_episode(
         candidates: trajectories of the gripper's frame from the pick to the release, the best first.
         seed: seed of the planner.
         watch: called every few steps with the cell, the state and the phase, such as `Recorder`.
+        planned: called when there is a plan, or none: the physics begins.
     """
     cell = build_workcell(
         robot,
@@ -145,6 +147,8 @@ def run_episode(
         fixed_target=TASKS[episode.task].fixed,
     )
     plan = plan_motion(candidates, robot, opening=episode.grip.opening, grip=0.0, cell=cell, seed=seed)
+    if planned is not None:
+        planned()
     wrong = _pick_error(episode, np.asarray(candidates[0][0]))
     if isinstance(plan, Failure):
         return Outcome.failure("pick wrong" if wrong else "unreachable", wrong or plan.reason)

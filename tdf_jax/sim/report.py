@@ -7,12 +7,14 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from tdf_jax.evaluation.statistics import bootstrap_interval
 from tdf_jax.sim.campaign import Run, Settings
 
+PARTS = ("imitation", "planning", "physics")  # of an episode's wall time
 RATES = ("grasp", "place", "overall", "strict")
-SCHEMA = 1  # raised when a key changes its name or its meaning
+SCHEMA = 2  # raised when a key changes its name or its meaning
 
 
 def rates(runs: Sequence[Run]) -> dict[str, tuple[float, list[float] | None]]:
@@ -61,20 +63,42 @@ def summary(runs: Sequence[Run]) -> str:
         slip, turn = np.nanmedian(slips, axis=0)
         lines.append(f"  moved in the hand, median: {1e3 * slip:.1f} mm, {turn:.1f} degrees")
     lines += [f"  failed: {cause}: {count}" for cause, count in causes(runs).items()]
-    imitation, physics = np.median([one.seconds for one in runs], axis=0)
+    parts = seconds(runs)
     rejected, redrawn = (sum(getattr(one, name) for one in runs) for name in ("rejected", "redrawn"))
     lines.append(f"  drawn before: {rejected} starts out of reach, {redrawn} pairs that do not fit")
-    lines.append(f"  seconds, median: imitation {imitation:.1f}, physics {physics:.1f}")
+    for words, values in (("median", np.median(parts, axis=0)), ("all episodes", parts.sum(axis=0))):
+        named = (f"{name} {_seconds(value)}" for name, value in zip(PARTS, values))
+        lines.append(f"  seconds, {words}: {', '.join(named)}")
     return "\n".join(lines)
+
+
+def seconds(runs: Sequence[Run]) -> Float[np.ndarray, "episodes 3"]:
+    """Wall times of imitation, planning and physics, (episodes, 3), seconds.
+
+    The last two are NaN where an earlier version kept only their sum; `teleport` plans nothing.
+
+    Args:
+        runs: the episodes.
+    """
+    return np.array([(one.seconds[0], one.planning, one.seconds[1] - one.planning) for one in runs])
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.1f}" if np.isfinite(value) else "unknown"
 
 
 def record(settings: Settings, runs: Sequence[Run]) -> dict[str, Any]:
     """The JSON record of a run: what is the same on a rerun, and "seconds", which are not.
 
+    Under "seconds" are the sums of the wall times of imitation, planning and physics, and these of every episode; null
+    where they are not known.
+
     Args:
         settings: what the episodes share.
         runs: the episodes.
     """
+    parts = seconds(runs)
+    times = [[value if np.isfinite(value) else None for value in row] for row in (parts.sum(axis=0), *parts)]
     return {
         "schema": SCHEMA,
         "tdf_jax": version("tdf_jax"),
@@ -95,5 +119,5 @@ def record(settings: Settings, runs: Sequence[Run]) -> dict[str, Any]:
             }
             for one in runs
         ],
-        "seconds": [one.seconds for one in runs],
+        "seconds": {**dict(zip(PARTS, times[0])), "episodes": times[1:]},
     }

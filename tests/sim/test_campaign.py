@@ -1,5 +1,6 @@
 """Campaigns: the same outcomes in any number of processes, kept between runs, and what cannot be measured."""
 
+import dataclasses
 import types
 
 import numpy as np
@@ -10,6 +11,7 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.sim import campaign
 from tdf_jax.sim.bodies import Body
 from tdf_jax.sim.campaign import TRUTH, Condition, Settings, centred_path, check_condition, run_campaign, run_one
+from tdf_jax.sim.episode import Outcome
 from tdf_jax.sim.report import record
 
 SHELF = Condition("bowl_on_shelf", "known", "upright", "execute", method=TRUTH)
@@ -146,6 +148,38 @@ def test_an_outcome_without_motion_is_kept_and_cannot_be_filmed(bench, tmp_path,
     assert first.outcome.cause == again.outcome.cause == "not found" and first.outcome.detail == again.outcome.detail
     with pytest.raises(InputError, match=r"episode 0 has no motion to film: relate\(\): the clouds are far apart"):
         campaign.film(made.settings, 0, tmp_path / "film.gif")
+
+
+def test_the_times_of_an_episode_are_apart(bench, monkeypatch):
+    """A clock that counts: 2 s of imitation, 4 s of planning, 8 s of physics."""
+    now = [0.0]
+    monkeypatch.setattr(campaign.time, "perf_counter", lambda: now[0])
+
+    def found(self, episode, shown):
+        now[0] += 2
+        return [np.eye(4)[None]], np.eye(4)
+
+    def run_episode(episode, robot, candidates, watch, planned):
+        now[0] += 4
+        planned()
+        now[0] += 8
+        return Outcome.failure("unreachable", "far")
+
+    monkeypatch.setattr(campaign._Bench, "found", found)
+    monkeypatch.setattr("tdf_jax.sim.episode.run_episode", run_episode)
+    made = bench()
+    monkeypatch.setattr(campaign, "_bench", lambda settings: made)
+    run = run_one(made.settings, 0)
+    assert run.seconds == (2.0, 12.0) and run.planning == 4.0
+
+
+def test_outcomes_of_an_earlier_version_are_read(bench, monkeypatch):
+    made = bench()
+    old = {**dataclasses.asdict(Outcome.failure("unreachable", "far")), "rejected": 1, "redrawn": 0, "seconds": (2, 9)}
+    monkeypatch.setattr(made, "run", lambda number: old)
+    monkeypatch.setattr(campaign, "_bench", lambda settings: made)
+    run = run_one(made.settings, 0)
+    assert run.seconds == (2.0, 9.0) and np.isnan(run.planning) and run.outcome.cause == "unreachable"
 
 
 def test_wrong_weights_are_no_failure_of_an_episode(bench, monkeypatch):

@@ -20,7 +20,7 @@ NEVER = Outcome(False, False, False, False, "unreachable", "far", np.nan, np.nan
 def runs():
     outcomes = (GOOD, GOOD, SLACK, FELL, FELL, NEVER, GOOD, GOOD)
     return [
-        Run(CONDITION, number, outcome, number % 3, number % 2, (1.0 + number, 10.0 + number))
+        Run(CONDITION, number, outcome, number % 3, number % 2, (1.0 + number, 10.0 + number), 2.0)
         for number, outcome in enumerate(outcomes)
     ]
 
@@ -45,7 +45,16 @@ def test_a_summary_says_all_of_it(runs):
     assert "  failed: fell: 2" in text
     assert "moved in the hand, median: 2.0 mm, 1.0 degrees" in text  # of 2, 2, 4, 6, 6, 2, 2
     assert "7 starts out of reach, 4 pairs that do not fit" in text
-    assert "imitation 4.5, physics 13.5" in text
+    assert "  seconds, median: imitation 4.5, planning 2.0, physics 11.5" in text
+    assert "  seconds, all episodes: imitation 36.0, planning 16.0, physics 92.0" in text
+
+
+def test_times_that_an_earlier_version_kept_are_unknown(runs, tmp_path):
+    runs[3] = Run(CONDITION, 3, FELL, 0, 1, (4.0, 13.0))
+    made = record(Settings(CONDITION, "mug", None, 7, tmp_path), runs)["seconds"]
+    assert (made["imitation"], made["planning"], made["physics"]) == (36.0, None, None)
+    assert made["episodes"][2:4] == [[3.0, 2.0, 10.0], [4.0, None, None]]
+    assert "  seconds, all episodes: imitation 36.0, planning unknown, physics unknown" in summary(runs)
 
 
 def test_a_record_is_json_whose_seconds_stand_apart(runs, tmp_path):
@@ -56,6 +65,7 @@ def test_a_record_is_json_whose_seconds_stand_apart(runs, tmp_path):
     assert again["episodes"][5]["slip"] is None and again["episodes"][3]["cause"] == "fell"
     assert [one["number"] for one in again["episodes"]] == list(range(8))
     assert again["rates"]["strict"]["rate"] == 0.5 and again["causes"]["fell"] == 2
-    slower = [Run(run.condition, run.number, run.outcome, run.rejected, run.redrawn, (99.0, 99.0)) for run in runs]
+    slower = [Run(run.condition, run.number, run.outcome, run.rejected, run.redrawn, (99.0, 99.0), 9.0) for run in runs]
+    assert made["seconds"]["episodes"][1] == [2.0, 2.0, 9.0] and made["seconds"]["planning"] == 16.0
     other = record(settings, slower)
     assert {key for key in made if made[key] != other[key]} == {"seconds"}
