@@ -239,9 +239,19 @@ def film(settings: Settings, number: int, path: Path) -> Outcome:
         number: number of the episode.
         path: .gif or .mp4 file.
 
+    Returns:
+        The outcome, the same as of the campaign.
+
     Raises:
         InputError: nothing can be rendered here, the ending is another one, or the episode has no motion.
     """
+    # In a process as those of the campaign: in this one, sums of products may have another order.
+    with _pool(1) as pool:
+        return pool.submit(film_one, settings, number, path).result()
+
+
+def film_one(settings: Settings, number: int, path: Path) -> Outcome:
+    """As `film`, in this process."""
     from tdf_jax.sim.episode import run_episode
     from tdf_jax.sim.recording import Recorder
 

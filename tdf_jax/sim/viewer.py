@@ -106,7 +106,8 @@ def _opened(model, data) -> Any:
 
     def launch():
         try:
-            opened.put(importlib.import_module("mujoco.viewer").launch_passive(model, data))
+            launch_passive = importlib.import_module("mujoco.viewer").launch_passive
+            opened.put(launch_passive(model, data, show_left_ui=False, show_right_ui=False))
         except Exception as error:  # every driver fails in its own way
             opened.put(error)
 

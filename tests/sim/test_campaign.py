@@ -6,12 +6,14 @@ import types
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.sim import campaign
 from tdf_jax.sim.bodies import Body
 from tdf_jax.sim.campaign import TRUTH, Condition, Settings, centred_path, check_condition, run_campaign, run_one
 from tdf_jax.sim.episode import Outcome
+from tdf_jax.sim.recording import check_film
 from tdf_jax.sim.report import record
 
 SHELF = Condition("bowl_on_shelf", "known", "upright", "execute", method=TRUTH)
@@ -45,6 +47,18 @@ def test_two_processes_give_the_same(first, tmp_path):
     folder, runs = first
     again = list(run_campaign(settings(tmp_path), 2, processes=2, progress=False))
     assert compared(tmp_path, again) == compared(folder, runs)
+
+
+@pytest.mark.slow
+def test_a_film_is_of_the_same_episode(first, tmp_path):
+    try:
+        check_film(path := tmp_path / "film.gif")
+    except InputError as error:
+        pytest.skip(f"FILM NOT CHECKED: {error}")
+    folder, runs = first
+    assert campaign.film(settings(folder), 0, path) == runs[0].outcome
+    with Image.open(path) as film:
+        assert getattr(film, "n_frames", 1) > 100
 
 
 @pytest.mark.slow
@@ -147,7 +161,7 @@ def test_an_outcome_without_motion_is_kept_and_cannot_be_filmed(bench, tmp_path,
     first, again = (run_one(made.settings, 0) for _ in range(2))
     assert first.outcome.cause == again.outcome.cause == "not found" and first.outcome.detail == again.outcome.detail
     with pytest.raises(InputError, match=r"episode 0 has no motion to film: relate\(\): the clouds are far apart"):
-        campaign.film(made.settings, 0, tmp_path / "film.gif")
+        campaign.film_one(made.settings, 0, tmp_path / "film.gif")
 
 
 def test_the_times_of_an_episode_are_apart(bench, monkeypatch):

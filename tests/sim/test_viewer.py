@@ -46,7 +46,8 @@ def windows(monkeypatch):
     """The windows that are opened."""
     opened = []
 
-    def launch(model, data):
+    def launch(model, data, **panels):
+        assert panels == {"show_left_ui": False, "show_right_ui": False}
         opened.append(Window(model, data))
         return opened[-1]
 
@@ -109,14 +110,14 @@ def test_a_closed_window_is_left_alone(windows, clock):
 
 
 def test_a_window_that_does_not_open_is_refused(monkeypatch):
-    def broken(model, data):
+    def broken(model, data, **panels):
         raise RuntimeError("no GLX")
 
     monkeypatch.setattr(window_of, "launch_passive", broken)
     with pytest.raises(InputError, match="the window does not open .no GLX.; see what the terminal says, or --video"):
         Viewer(falling()[0])
     monkeypatch.setattr(viewer, "OPENING", 0.01)
-    monkeypatch.setattr(window_of, "launch_passive", lambda model, data: viewer.threading.Event().wait(5))
+    monkeypatch.setattr(window_of, "launch_passive", lambda model, data, **panels: viewer.threading.Event().wait(5))
     with pytest.raises(InputError, match="nothing after 0.01 s"):
         Viewer(falling()[0])
 
