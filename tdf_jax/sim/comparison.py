@@ -7,6 +7,7 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
@@ -76,10 +77,9 @@ class Row:
         """Numbers of starts out of reach and of pairs that do not fit, drawn before the episodes."""
         return sum(one.rejected for one in self.runs), sum(one.redrawn for one in self.runs)
 
-    def seconds(self) -> tuple[float, float]:
-        """Median times of the imitation and of the physics, seconds."""
-        imitation, physics = np.median([one.seconds for one in self.runs], axis=0)
-        return float(imitation), float(physics)
+    def seconds(self) -> Float[np.ndarray, "episodes 3"]:
+        """Wall times of `tdf_jax.sim.report.PARTS`, (episodes, 3), seconds; NaN where one is not known."""
+        return report.seconds(self.runs)
 
 
 def planned_rows(
@@ -418,20 +418,40 @@ def _failures(rows: Sequence[Row]) -> str:
 
 
 def _times(rows: Sequence[Row], settings: Mapping[str, Any]) -> str:
-    cells = [
-        [_words(row.condition.task), row.condition.mode, *_conditions(row), *(f"{one:.1f}" for one in row.seconds())]
-        for row in rows
-    ]
+    cells = []
+    for row in rows:
+        seconds = row.seconds()
+        total = float(seconds.sum())
+        cells.append(
+            [
+                _words(row.condition.task),
+                row.condition.mode,
+                *_conditions(row),
+                *map(_number, np.median(seconds, axis=0)),
+                _number(total / 60),
+            ]
+        )
     about = machine()
     versions = ", ".join(f"{name} {about[name]}" for name in ("jax", "mujoco", "mink"))
     processes = settings.get("processes")
+    shares = ""
+    spent = np.nansum(np.concatenate([row.seconds() for row in rows]), axis=0)
+    if spent.sum() > 0:
+        parts = ", ".join(f"{name} {percent(float(one / spent.sum()))}" for name, one in zip(report.PARTS, spent))
+        shares = f" Of all the time known here: {parts}."
+    heads = ["task", "mode", *CONDITIONS, *report.PARTS, "all episodes, minutes"]
     return (
         "Median seconds of an episode in its process, compilation included where an episode compiles: imitation "
-        "(clouds, pick, goal), and physics (planning and execution, or both tests of teleport). "
+        "(clouds, pick, goal), planning of the arm's motion, which teleport does not need, and physics. The last "
+        "column is the sum over all episodes, which several processes share. "
         f"{about['cores']} cores, {versions}, "
         f"{'a process for each core' if processes is None else f'processes: {processes}'}; times of earlier runs in "
-        "the same folder are theirs.\n\n" + markdown(["task", "mode", *CONDITIONS, "imitation", "physics"], cells)
+        f"the same folder are theirs.{shares}\n\n" + markdown(heads, cells)
     )
+
+
+def _number(value: float) -> str:
+    return f"{value:.1f}" if np.isfinite(value) else "unknown"
 
 
 def _words(task: str) -> str:

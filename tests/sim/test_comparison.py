@@ -1,5 +1,6 @@
 """The page and the record of `tdf benchmark --simulation`, of outcomes that are known."""
 
+import dataclasses
 import json
 import re
 from typing import Any
@@ -33,7 +34,7 @@ def row(tmp_path):
 
     def make(*outcomes, **changes):
         condition = RACK._replace(**changes)
-        runs = [Run(condition, n, one, n % 3, n % 2, (2.0 + n, 20.0 + n)) for n, one in enumerate(outcomes)]
+        runs = [Run(condition, n, one, n % 3, n % 2, (2.0 + n, 20.0 + n), 5.0) for n, one in enumerate(outcomes)]
         return Row(Settings(condition, "mug", "rack", 3, tmp_path), runs)
 
     return make
@@ -146,7 +147,18 @@ def test_failures_draws_and_times_are_in_the_page(row):
     assert failed["starts rejected"] == "4" and failed["pairs rejected"] == "2"  # 0, 1, 2, 0, 1 and 0, 1, 0, 1, 0
     assert failed["moved in the hand"] == "6.0 mm, 3.0°"  # of 2, 6, 6, 20 mm and 1, 5, 5, 1 degrees
     (times,) = table(text, "## Times")
-    assert (times["imitation"], times["physics"]) == ("4.0", "22.0")
+    assert [times[name] for name in ("imitation", "planning", "physics")] == ["4.0", "5.0", "17.0"]
+    assert times["all episodes, minutes"] == "2.2"  # 20, 25 and 85 s
+    assert "imitation 15 %, planning 19 %, physics 65 %." in text
+
+
+def test_times_that_are_not_known_are_said_to_be_unknown(row):
+    one = row(GOOD, GOOD)
+    one.runs[:] = [dataclasses.replace(run, planning=np.nan) for run in one.runs]
+    text = page([one], SETTINGS)
+    (times,) = table(text, "## Times")
+    assert times["planning"] == times["physics"] == times["all episodes, minutes"] == "unknown"
+    assert json.dumps(record([one], SETTINGS), allow_nan=False)
 
 
 def test_nothing_held_is_no_movement(row):
