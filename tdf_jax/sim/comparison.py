@@ -67,6 +67,15 @@ class Row:
         """What each episode has in a rate, 0 or 1, by the object: the task and the number of the episode."""
         return {(self.condition.task, one.number): float(getattr(one.outcome, rate)) for one in self.runs}
 
+    def likely(self, rate: str) -> tuple[float, float]:
+        """Interval of a rate; where all episodes are alike the bootstrap has no width, and the rule of three counts."""
+        share, interval = self.rates[rate]
+        low, high = interval or (share, share)
+        if low == high:
+            reach = 3 / len(self.runs)  # of n successes, a rate below 1 - 3 / n is unlikely (5 %)
+            low, high = max(low - reach, 0.0), min(high + reach, 1.0)
+        return low, high
+
     def moved(self) -> tuple[float, float] | None:
         """Median movement in the hand after closing, metres and degrees; None if nothing was held."""
         moved = np.array([(one.outcome.slip, one.outcome.turn) for one in self.runs], float)
@@ -238,7 +247,7 @@ def reading(rows: Sequence[Row]) -> list[str]:
             lines.append(f"- Causes of failure in {total} {words} episodes of the library: {listed}.")
     few = min(len(row.runs) for row in rows)
     if few < FEW:
-        lines.append(f"- Rows of {few} episodes show that the command works, and little else: look at the intervals.")
+        lines.append(f"- Rows of {few} episodes show that the command works, and little else.")
     general = (
         "Teleport tests the grasp and the placement apart, and nothing moves between them. An executed episode also "
         "needs a posture of the arm at both ends, a way without collision, and an object that does not move in the "
@@ -257,8 +266,7 @@ def _against_published(ours: Sequence[Row]) -> list[str]:
             peers = [one for one in peers_of(row.condition) if one.system == system]
             theirs = getattr(max(peers, key=lambda one: one.demonstrations), name) if peers else None
             if theirs is not None:
-                rate, interval = row.rates[name]
-                low, high = interval or (rate, rate)
+                low, high = row.likely(name)
                 counts["below" if theirs < low else "above" if theirs > high else "in"] += 1
         total = sum(counts.values())
         if total:
@@ -322,8 +330,9 @@ def _setup(rows: Sequence[Row], settings: Mapping[str, Any]) -> str:
         "[development measurements](simulation_notes.md) what was tried on the way.\n\n"
         f"`{_command(settings)}` made this page and [the record of every episode](simulation/simulation.json): "
         f"{' or '.join(map(str, episodes))} episodes a row, each with an unseen generated object. {masses} "
-        "Intervals in brackets are 95 % bootstrap intervals over objects. Starts were drawn before any method ran, and "
-        "those out of reach were rejected.\n\n"
+        "Intervals in brackets are 95 % bootstrap intervals over objects; where all episodes of a row are alike they "
+        "have no width, and a rate that differs by less than 3 over the number of episodes remains likely. Starts were "
+        "drawn before any method ran, and those out of reach were rejected.\n\n"
         f"The columns of other systems are the published rates of {', '.join(PAPERS.values())}: same protocol, other "
         "objects. Theirs are of ShapeNet, seen by depth cameras, with ten demonstrations where no other number is "
         "given. NDF and L-NDF reset the object to the predicted pose and test the grasp apart, with a target that "

@@ -208,13 +208,25 @@ def test_no_change_is_said_to_be_none_and_one_point_is_one(row):
 
 
 def test_the_reading_says_where_published_rates_lie(row):
-    rows = [row(*[GOOD] * 5), row(*[FELL] * 5, poses="tilt60"), row(*[GOOD, GOOD, FELL] * 2, target="found")]
+    rows = [row(*[GOOD] * 40), row(*[FELL] * 40, poses="tilt60"), row(*[GOOD, GOOD, FELL] * 2, target="found")]
     text = "\n".join(reading(rows))
     assert re.search(
         r"- NDF, overall: the published rate is below our interval in 1, in it in 0 and above it in 1 of 2 rows", text
     )
     assert re.search(
         r"- R-NDF, place: the published rate is below our interval in 0, in it in 1 and above it in 0 of 1 rows", text
+    )
+
+
+def test_equal_outcomes_do_not_make_a_rate_certain(row):
+    assert row(*[GOOD] * 40).likely("overall") == pytest.approx((0.925, 1))
+    assert row(*[FELL] * 40).likely("overall") == pytest.approx((0, 0.075))
+    assert row(GOOD, GOOD).likely("overall") == (0, 1) == row(GOOD).likely("overall")
+    mixed = row(GOOD, FELL, GOOD)
+    assert mixed.likely("overall") == tuple(mixed.rates["overall"][1])
+    # L-NDF's 99.5 % is no less than 40 of 40
+    assert (
+        "- L-NDF, overall: the published rate is below our interval in 0, in it in 1" in reading([row(*[GOOD] * 40)])[1]
     )
 
 
