@@ -9,6 +9,7 @@ Modules:
     workcell: the table, an arm or a floating gripper, the object and the target
     cameras: depth cameras around a cell, and clouds of what they see
     kinematics: inverse kinematics of an arm, at a pose and along a path
+    posture: the distinct positions of the joints with which the gripper is at a pose
     collision: what touches what at planned positions
     transit: free motions from one posture to another
     joint_trajectory: a timed motion of the joints, and its files

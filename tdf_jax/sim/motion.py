@@ -14,6 +14,7 @@ from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.sim.collision import Collisions
 from tdf_jax.sim.joint_trajectory import JointTrajectory
 from tdf_jax.sim.kinematics import FOLLOWING, Kinematics, kinematics_of
+from tdf_jax.sim.posture import HALF_TURN, Postures
 from tdf_jax.sim.retiming import retime
 from tdf_jax.sim.robot import Robot
 from tdf_jax.sim.transit import connect
@@ -22,8 +23,6 @@ from tdf_jax.sim.workcell import Workcell
 APPROACH = 0.10  # metres along the approach before the pick, and back after the release
 SPACING, TURN = 0.005, 0.05  # metres and radians between poses for which the joints are computed
 MAX_STEP = 0.35  # radians, largest step of a joint between them; a larger one is another posture of the arm
-SEARCHES = 40  # starts of the search for postures at the pick
-SAME = 0.05  # radians, postures nearer than this are one
 CLOSE_SECONDS, OPEN_SECONDS = 1.0, 0.6  # to close the fingers and to open them
 CARRYING = 0.4  # factor on the limits of velocity and acceleration with an object in the hand, which swings and slips
 RATE = 125.0  # samples per second
@@ -154,13 +153,13 @@ def plan_motion(
     """
     kinematics = kinematics_of(robot)
     collisions = None if cell is None else Collisions(cell)
-    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    postures = Postures(kinematics)
     reasons: list[tuple[int, str]] = []
     for number, poses in enumerate(candidates):
-        for half, share in itertools.product((np.eye(4), half_turn), SHORTER):
+        for half, share in itertools.product((np.eye(4), HALF_TURN), SHORTER):
             turned = np.asarray(poses, float) @ half
             path = _Path(turned, share * approach)
-            ways = _ways(kinematics, collisions, path, opening, share * ARRIVAL, seed, reasons)
+            ways = _ways(postures, collisions, path, opening, share * ARRIVAL, seed, reasons)
             for there, carried, away in ways:
                 transits = _transits(robot, collisions, path, there[0], away[-1], opening, seed)
                 if transits is None:
@@ -215,39 +214,17 @@ def _between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     return poses
 
 
-def _postures(kinematics: Kinematics, T) -> Iterator[np.ndarray]:
-    """Distinct postures of the arm at a pose: what is found from home, then from anywhere."""
-    robot = kinematics.robot
-    rng = np.random.default_rng(0)
-    found: list[np.ndarray] = []
-    for number in range(1 + SEARCHES):
-        start = robot.home + (rng.uniform(-np.pi, np.pi, robot.num_joints) if number else 0.0)
-        solution = kinematics.solve(T, np.clip(start, robot.lower, robot.upper))
-        if solution is not None:
-            wrapped = _near(robot, solution)
-            if all(np.abs(wrapped - other).max() > SAME for other in found):
-                found.append(wrapped)
-                yield wrapped
-
-
-def _near(robot: Robot, joints: np.ndarray) -> np.ndarray:
-    """The same posture, with whole turns of the joints towards home where the limits allow it."""
-    turns = np.round((joints - robot.home) / (2 * np.pi))
-    moved = joints - 2 * np.pi * turns
-    return np.where((moved >= robot.lower) & (moved <= robot.upper), moved, joints)
-
-
 def _ways(
-    kinematics: Kinematics, collisions, path: _Path, opening: float, arrival: float, seed: int, reasons
+    postures: Postures, collisions, path: _Path, opening: float, arrival: float, seed: int, reasons
 ) -> Iterator[tuple]:
     """Joints to the pick, from there to the release, and away, for one posture of the arm after the other.
 
     The arm follows the whole path, or else both ends of it, joined by a free motion with the object in the hand.
     """
-    last = len(path.poses) - 1
+    kinematics, last = postures.kinematics, len(path.poses) - 1
     leave, arrive = path.near_pick(DEPARTURE)[-1], path.near_release(arrival)[0]
     picks, releases = [], []
-    for posture in _postures(kinematics, path.poses[path.pick]):
+    for posture in postures.at(path.poses[path.pick]):
         start = _followed(kinematics, path, posture, path.pick, 0, leave)
         if start is None:
             reasons.append((1, "the arm cannot follow the path within its limits"))
@@ -272,7 +249,7 @@ def _ways(
             reasons.append((2, blocked))
     if not picks or collisions is None or arrive <= leave:
         return
-    for posture in _postures(kinematics, path.poses[path.release]):
+    for posture in postures.at(path.poses[path.release]):
         end = _followed(kinematics, path, posture, path.release, arrive, last)
         if end is not None and _blocked(collisions, path, end, range(arrive, last + 1), opening) is None:
             releases.append(end)

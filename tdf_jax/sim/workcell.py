@@ -112,9 +112,9 @@ class Workcell:
 
 def quaternion(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4"]:
     """Quaternion wxyz of the rotation of a pose, 4x4."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
+    wxyz = np.empty(4)
+    extra("quaternion()", "mujoco").mju_mat2Quat(wxyz, np.ascontiguousarray(T[:3, :3], float).ravel())
+    return wxyz
 
 
 def build_workcell(

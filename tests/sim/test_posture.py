@@ -1,0 +1,44 @@
+"""Postures: they reach the pose, and half a turn of the gripper costs no new search."""
+
+import dataclasses
+
+import numpy as np
+from conftest import angle, downward
+
+from tdf_jax.sim.kinematics import Kinematics, kinematics_of
+from tdf_jax.sim.posture import HALF_TURN, SEARCHES, Postures
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Counted(Kinematics):
+    """Kinematics that notes what it solves."""
+
+    solved: list = dataclasses.field(default_factory=list)
+
+    def solve(self, T, start, iterations=40):
+        self.solved.append(T)
+        return super().solve(T, start, iterations)
+
+
+def test_every_posture_is_at_the_pose_and_another(robot):
+    T, kinematics = downward(0.45, 0.1, 0.2), kinematics_of(robot)
+    found = list(Postures(kinematics).at(T))
+    assert len(found) > 1
+    for number, joints in enumerate(found):
+        reached = kinematics.pose(joints)
+        assert np.linalg.norm(reached[:3, 3] - T[:3, 3]) < 1e-4 and angle(reached, T) < 0.1
+        assert ((joints >= robot.lower) & (joints <= robot.upper)).all()
+        assert all(np.abs(joints - other).max() > 0.05 for other in found[:number])
+
+
+def test_a_pose_is_searched_once_and_half_a_turn_from_what_is_known(robot):
+    T, kinematics = downward(0.45, 0.1, 0.2), Counted(robot)
+    postures = Postures(kinematics)
+    found = list(postures.at(T))
+    assert len(kinematics.solved) == 1 + SEARCHES
+    assert list(postures.at(T)) == found and len(kinematics.solved) == 1 + SEARCHES
+    turned = list(postures.at(T @ HALF_TURN))
+    assert len(kinematics.solved) == 1 + SEARCHES + len(found)
+    assert len(turned) == len(found)
+    for joints in turned:
+        assert angle(kinematics.pose(joints), T @ HALF_TURN) < 0.1
