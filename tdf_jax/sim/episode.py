@@ -9,6 +9,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from tdf_jax.evaluation.relation_success import UPRIGHT, hole_is_crossed
+from tdf_jax.geometry.symmetry import ROUND
 from tdf_jax.shapes import Mug, Rack
 from tdf_jax.sim.collision import ARM, HAND_KIND, OBJECT_KIND, TABLE_KIND, TARGET_KIND, geom_kinds
 from tdf_jax.sim.execution import execute
@@ -290,8 +291,9 @@ def _pick_error(episode: Episode, pick) -> str:
     """What is wrong with a pick, in words; empty near a true one, up to the turn about a round object's axis."""
     local = np.linalg.inv(episode.T_world_object) @ pick
     true = episode.grip.T_object_grip
-    turns = np.linspace(0, 2 * np.pi, 180, endpoint=False) if episode.object.fold == 0 else [0.0]
-    if episode.object.fold in (2, 4):
+    round_grasp = ROUND in (episode.object.fold, episode.grip.fold)
+    turns = np.linspace(0, 2 * np.pi, 180, endpoint=False) if round_grasp else [0.0]
+    if episode.object.fold in (2, 4) and not round_grasp:
         turns = np.arange(episode.object.fold) * 2 * np.pi / episode.object.fold
     best = (np.inf, np.inf)
     for turn in turns:

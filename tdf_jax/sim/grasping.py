@@ -4,14 +4,16 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from tdf_jax.sim.bodies import Body
 from tdf_jax.sim.physics import TIMESTEP, extra
 from tdf_jax.sim.robot import PREFIX, Robot
+from tdf_jax.sim.swing import level_rotations
 from tdf_jax.sim.workcell import FIXTURE, HAND, OBJECT, Workcell, build_workcell, quaternion
 
 CLOSE, LIFT, TURN_TIME, HOLD = 1.0, 1.0, 1.5, 2.0  # seconds of the phases
+LET_GO = 0.2  # seconds after a fixture lets go
 LIFTED = 0.15  # metres
 MOST_SLIP, MOST_TURN = 0.01, 10.0  # metres and degrees that an object may move in the hand after closing
 
@@ -66,11 +68,11 @@ def test_grasp(
     struck = hand.penetration()
     before = cell.body_pose(data, OBJECT)
     hand.close(grip, CLOSE)
-    if fixture:
-        data.eq_active[cell.model.equality(FIXTURE).id] = 0
-        hand.wait(0.2)
     closed, now = hand.T_grip_object, cell.body_pose(data, OBJECT)
     pulled = float(np.linalg.norm((now @ _point(one.centre) - before @ _point(one.centre))[:3]))
+    if fixture:
+        data.eq_active[cell.model.equality(FIXTURE).id] = 0
+        hand.wait(LET_GO)
     lifted = np.array(T_world_grip, float)
     lifted[2, 3] += LIFTED
     hand.move(lifted, LIFT)
@@ -128,14 +130,13 @@ class FloatingHand:
             self._mujoco.mj_step(self.cell.model, self.data)
 
     def move(self, T: Float[np.ndarray, "4 4"], seconds: float) -> None:
-        """Move the gripper's frame to a pose, 4x4, on the straight line and geodesic, smoothly."""
+        """Move the gripper's frame to a pose, 4x4, straight and turning as `level_rotations` does, smoothly."""
         start, steps = self._pose, int(round(seconds / TIMESTEP))
-        slerp = Slerp([0, 1], Rotation.from_matrix(np.stack([start[:3, :3], T[:3, :3]])))
-        for step in range(1, steps + 1):
-            share = step / steps
-            share = share**3 * (10 - 15 * share + 6 * share**2)  # at rest at both ends
+        shares = np.arange(1, steps + 1) / steps
+        shares = shares**3 * (10 - 15 * shares + 6 * shares**2)  # at rest at both ends
+        for share, rotation in zip(shares, level_rotations(start[:3, :3], T[:3, :3], shares)):
             pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = slerp(share).as_matrix(), start[:3, 3] + share * (T[:3, 3] - start[:3, 3])
+            pose[:3, :3], pose[:3, 3] = rotation, start[:3, 3] + share * (T[:3, 3] - start[:3, 3])
             self._drive(pose)
             self._mujoco.mj_step(self.cell.model, self.data)
         self._pose = np.array(T, float)

@@ -6,16 +6,29 @@ import numpy as np
 from jaxtyping import Float
 
 from tdf_jax._internal.errors import InputError
+from tdf_jax.geometry.symmetry import ROUND
 from tdf_jax.shapes import Shape
 from tdf_jax.sim.robot import Fingers
 
 CLEARANCE = 0.018  # metres between each finger and the wall before closing
-NECK_CLEARANCE = 0.010  # of a neck, whose middle the cloud shows well
+NECK_CLEARANCE, LEAST_CLEARANCE = 0.010, 0.006  # of a neck, whose middle the cloud shows well
 RIM_DEPTH = 0.030  # metres from the rim down the wall to the tips of the fingers
 MOST_DEPTH = 0.6  # of the height of a low bowl
-NECK_DEPTHS = (0.022, 0.070)  # metres from a bottle's top to the tips
-LEVEL, STEP = 0.0015, 0.002  # metres: pads touch where the width is the largest between them, up to `LEVEL`
+NECK_DEPTHS = (0.012, 0.052)  # metres from a bottle's top to the tips; the palm is 0.055 m behind them
+LEVEL_STEP = 0.001  # metres between levels at which a neck is measured
+TOUCHED = 0.0003  # metres: pads touch where the width is the largest between them, up to this
 TIPS = 0.0187  # metres from the middle of the pads to their tips
+HALF_PAD = 0.011  # metres, half the width of the pads
+# Metres from the tips within which pads slide off a slope, and beyond which the fingers of the 2F-85, which adapt to
+# what they enclose, give way; and the share that a grasp is worth there.
+EDGE, UNSTEADY, AT_EDGE = 0.005, 0.009, 0.3
+STEEP = 0.4  # radius over length of a slope on which the tips do not hold at all
+NEAR = 0.020  # metres between pads and centre of mass, below which nearer is no better
+RECESS = 0.003  # metres by which the fingers are further apart behind the pads
+DIRECTIONS, ROUND_TOLERANCE = (
+    24,
+    0.0015,
+)  # directions of widths about the axis, and their difference, metres, when round
 # Where a wall's middle is measured below the rim, metres: the gripper lies along the line through both.
 WALL_LEVELS = (0.004, 0.025)
 WALL_SEARCH = np.linspace(-0.07, 0.025, 951)  # metres along the outward direction
@@ -28,11 +41,14 @@ class Grip(NamedTuple):
         T_object_grip: pose of the gripper's frame, 4x4, metres, object frame.
         width: width of what is held, metres.
         opening: opening of the fingers before they close, metres.
+        fold: symmetry of the grasp about the object's z axis, see `tdf_jax.geometry.symmetry`: `ROUND` if every turn
+            about it is the same grasp, 1 if only this one is demonstrated.
     """
 
     T_object_grip: Float[np.ndarray, "4 4"]
     width: float
     opening: float
+    fold: int = 1
 
 
 def grip_of(shape: Shape, fingers: Fingers) -> Grip:
@@ -85,30 +101,54 @@ def _wall(shape: Shape, rim, level: float) -> tuple[np.ndarray, float]:
 
 
 def _neck_grip(shape: Shape, fingers: Fingers) -> Grip:
-    """From above, closing along the y axis; the axis of a round bottle leaves the turn about it free.
+    """From above, closing along the y axis, which is any direction where the neck and all above it are round.
 
-    The tips are where the pads touch along the greatest length: a bottle that is held at one point swings.
+    Pads are flat, and touch a cone at its widest ring only. Of all depths the one is taken at which what the pads touch
+    is long, wide and near the centre of mass, and lies within the pads: their tips would slide off a slope.
     """
-    top = float(shape.mesh.bounds[1, 2])
-    below = np.arange(0.001, NECK_DEPTHS[1], STEP)
-    widths = np.array([_width(shape, top - level) for level in below])
-    widest = fingers.widest - 2 * NECK_CLEARANCE
-    depths = [depth for depth in np.arange(*NECK_DEPTHS, STEP) if widths[below <= depth].max() <= widest]
-    lengths = []
-    for depth in depths:
-        between = widths[(below <= depth) & (below > depth - 2 * TIPS)]
-        lengths.append(int((between > between.max() - LEVEL).sum()))
-    if not depths:
+    mesh = shape.mesh
+    top, centre = float(mesh.bounds[1, 2]), float(mesh.center_mass[2])
+    levels = np.arange(LEVEL_STEP, min(NECK_DEPTHS[1], 0.8 * shape.height), LEVEL_STEP)  # below the top
+    widths, spreads = _widths(mesh, top - levels)
+    found = []
+    for tips in np.flatnonzero(levels >= NECK_DEPTHS[0]):
+        depth, inserted = levels[tips], widths[: tips + 1]
+        pads = levels[: tips + 1] > depth - 2 * TIPS
+        width = float(inserted[pads].max())
+        clearance = min(NECK_CLEARANCE, (fingers.widest - float(inserted.max())) / 2)
+        if clearance < LEAST_CLEARANCE or inserted.max() > width + RECESS:
+            continue
+        touched = levels[: tips + 1][pads & (inserted > width - TOUCHED)]
+        length, lever = float(np.ptp(touched)), abs(top - float(touched.mean()) - centre)
+        score = (width + 2 * length) / max(lever, NEAR)
+        if depth - touched.mean() < EDGE:
+            slope = float(inserted[-1] - inserted[max(0, tips - 3)]) / (6 * LEVEL_STEP)
+            score *= AT_EDGE * min(max(1 - slope / STEEP, 0.01), 1)
+        elif depth - touched.max() > UNSTEADY:
+            score *= AT_EDGE
+        is_round = bool((spreads[: tips + 1] < ROUND_TOLERANCE).all())
+        found.append((is_round, score, depth, width, float(inserted.max()) + 2 * clearance))
+    if not found:
         raise InputError(f"grip_of(): the neck of the bottle is wider than the gripper, {1e3 * fingers.widest:.0f} mm")
-    depth = depths[int(np.argmax(lengths))]
-    width = float(widths[(below <= depth) & (below > depth - 2 * TIPS)].max())
+    is_round, _, depth, width, opening = max(found)
     T = np.diag([-1.0, 1.0, -1.0, 1.0])
-    T[2, 3] = top - (depth - TIPS - fingers.depth(width))
-    return Grip(T, width, min(float(widths[below <= depth].max()) + 2 * NECK_CLEARANCE, fingers.widest))
+    T[2, 3] = top - (depth - fingers.tip(width))
+    return Grip(T, width, opening, ROUND if is_round else 1)
 
 
-def _width(shape: Shape, level: float) -> float:
-    """Width of an object along y at a height, metres."""
-    y = np.linspace(0, 0.06, 301)
-    inside = np.flatnonzero(shape.contains(np.stack([np.zeros_like(y), y, np.full_like(y, level)], axis=1)))
-    return 2 * float(y[inside[-1]]) if len(inside) else 0.0
+def _widths(mesh, heights) -> tuple[np.ndarray, np.ndarray]:
+    """Widths of a mesh along y between the pads at heights, and how much those about the z axis differ, metres."""
+    ends = np.asarray(mesh.vertices)[np.asarray(mesh.edges_unique)]
+    low, high = np.sort(ends[:, :, 2], axis=1).T
+    widths, spreads = np.zeros(len(heights)), np.zeros(len(heights))
+    turns = np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False)
+    directions = np.stack([np.cos(turns), np.sin(turns)])
+    for number, height in enumerate(heights):
+        start, end = ends[(low <= height) & (high > height)].transpose(1, 0, 2)
+        share = (height - start[:, 2:]) / (end[:, 2:] - start[:, 2:])
+        section = (start + share * (end - start))[:, :2]
+        between = section[np.abs(section[:, 0]) < HALF_PAD]
+        if len(between):
+            widths[number] = 2 * np.abs(between[:, 1]).max()
+            spreads[number] = 2 * np.ptp((section @ directions).max(axis=0))
+    return widths, spreads

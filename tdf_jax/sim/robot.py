@@ -41,6 +41,7 @@ class Fingers:
         openings: gaps between the fingers, (commands,), metres, falling.
         depths: middle of the pads along the approach from the site, (commands,), metres. The pads of the 2F-85 move
             along the approach as it closes.
+        tips: tips of the pads along the approach from the site, (commands,), metres.
         joints: names of the fingers' joints.
         positions: their positions, (commands, joints), radians or metres.
     """
@@ -48,6 +49,7 @@ class Fingers:
     commands: Float[np.ndarray, " commands"]
     openings: Float[np.ndarray, " commands"]
     depths: Float[np.ndarray, " commands"]
+    tips: Float[np.ndarray, " commands"]
     joints: tuple[str, ...]
     positions: Float[np.ndarray, "commands joints"]
 
@@ -67,6 +69,10 @@ class Fingers:
     def depth(self, opening: float) -> float:
         """Middle of the pads along the approach at an opening, metres from the site."""
         return float(np.interp(opening, self.openings[::-1], self.depths[::-1]))
+
+    def tip(self, opening: float) -> float:
+        """Tips of the pads along the approach at an opening, metres from the site."""
+        return float(np.interp(opening, self.openings[::-1], self.tips[::-1]))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -305,21 +311,22 @@ def _calibrated(robot: Robot) -> Fingers:
             mujoco.mj_step(model, data)
         rows.append(_gap(mujoco, model, data, robot.site))
         positions.append([float(data.joint(name).qpos[0]) for name in others])
-    openings, depths = np.array(rows).T
+    openings, depths, tips = np.array(rows).T
     if openings[0] < openings[-1]:  # the largest command opens
-        commands, openings, depths, positions = commands[::-1], openings[::-1], depths[::-1], positions[::-1]
+        commands, openings, positions = commands[::-1], openings[::-1], positions[::-1]
+        depths, tips = depths[::-1], tips[::-1]
     if openings[-2] < CLOSED and not openings[-1] < openings[-2]:
-        openings[-1], depths[-1] = 0.0, depths[-2]  # the pads touch, and a ray begins in one of them
+        openings[-1], depths[-1], tips[-1] = 0.0, depths[-2], tips[-2]  # the pads touch: a ray begins in one of them
     if not np.isfinite(openings).all() or not (np.diff(openings) < 0).all():
         raise InputError(
             f"load_robot(): the gap at the site {robot.site!r} is {np.round(openings, 4)} m from command to command; "
             "expected two fingers on both sides along the site's y axis, whose actuator closes them"
         )
-    return Fingers(commands.copy(), openings.copy(), depths.copy(), tuple(others), np.array(positions))
+    return Fingers(commands.copy(), openings.copy(), depths.copy(), tips.copy(), tuple(others), np.array(positions))
 
 
-def _gap(mujoco, model, data, site: str) -> tuple[float, float]:
-    """Gap between the pads along the site's y axis, and their middle along z: the fingers from their tips backwards."""
+def _gap(mujoco, model, data, site: str) -> tuple[float, float, float]:
+    """Gap between the pads along the site's y axis, and their middle and tips along z, from the tips backwards."""
     frame = data.site(site)
     R, hit = frame.xmat.reshape(3, 3), np.zeros(1, np.int32)
     gaps = []
@@ -329,8 +336,8 @@ def _gap(mujoco, model, data, site: str) -> tuple[float, float]:
         gaps.append(sum(sides) if min(sides) >= 0 else np.nan)
     between = np.flatnonzero(np.isfinite(gaps))
     if not len(between):
-        return np.nan, np.nan
+        return np.nan, np.nan, np.nan
     tip = int(between[0])
     other = np.flatnonzero(~(np.abs(np.array(gaps[tip:]) - gaps[tip]) <= LEVEL))
     pads = slice(tip, tip + int(other[0]) if len(other) else None)
-    return float(np.mean(gaps[pads])), float(HEIGHTS[::-1][pads].mean())
+    return float(np.mean(gaps[pads])), float(HEIGHTS[::-1][pads].mean()), float(HEIGHTS[::-1][tip])

@@ -19,6 +19,7 @@ from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.paths import hang_on_rack, lift_over
 from tdf_jax.geometry.query import box_query, gripper_query
 from tdf_jax.geometry.sampling import sample_surface
+from tdf_jax.geometry.symmetry import ROUND
 from tdf_jax.geometry.target import Target
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.shapes import FAMILIES, Mug, Rack, Shape
@@ -28,6 +29,7 @@ from tdf_jax.sim.collision import Collisions
 from tdf_jax.sim.grasps import Grip, grip_of
 from tdf_jax.sim.kinematics import kinematics_of
 from tdf_jax.sim.robot import Robot
+from tdf_jax.sim.swing import level_rotations
 from tdf_jax.sim.workcell import build_workcell
 
 POSES = ("upright", "tilt60", "uniform")
@@ -43,6 +45,9 @@ STARTS, MOST_PAIRS = 25, 20  # starts that are drawn of a pair, and pairs that a
 OTHER_PAIRS = 10_000_000  # between the numbers of the pairs of an episode
 BEHIND = 0.10  # metres behind the pick and the release, along the approach, which must be within reach too
 SAME_POSTURE = 1.5  # radians, largest movement of a joint on the way there
+# Sine of the tilt from which a held object swings, and angles, radians, between the closing direction and the plane in
+# which it would not swing that are tried.
+UPRIGHT, OFF_PLANE = 0.02, tuple(np.radians([0.0, 10.0, -10.0]))
 SEARCHES = 12  # starts of the search for a posture of the arm at the true pick and at the true release
 
 
@@ -179,9 +184,11 @@ def draw_episode(
                 rejected=rejected,
                 redrawn=redrawn,
             )
-            made.__dict__.update(bodies)
-            if within_reach(made, robot, collisions):
-                return made
+            for turned in _turned(grip, made.T_world_object):
+                tried = dataclasses.replace(made, grip=turned)
+                tried.__dict__.update(bodies)
+                if within_reach(tried, robot, collisions):
+                    return tried
             rejected += 1
         redrawn += 1
     raise InputError(
@@ -250,7 +257,7 @@ def demonstrate_episode(episode: Episode, seed: int, points: int = 1500) -> Demo
         path = Trajectory(jnp.asarray(np.concatenate([onto, down])))
     else:
         height = float(episode.target.mesh.extents[2]) + CLEARANCE
-        path = lift_over(NUM_POSES, pick[:3, 3], release[:3, 3], height=height, **ends)
+        path = _level(lift_over(NUM_POSES, pick[:3, 3], release[:3, 3], height=height, **ends))
     key = jax.random.key(0)
     return Demonstration(
         points=moved(sample_surface(episode.object.mesh, points, rng), episode.T_world_object).astype(np.float32),
@@ -262,6 +269,16 @@ def demonstrate_episode(episode: Episode, seed: int, points: int = 1500) -> Demo
             T_world_contact=np.asarray(se3.pose(T_world_contact[:3, :3], T_world_contact[:3, 3])),
         ),
     )
+
+
+def _level(path: Trajectory) -> Trajectory:
+    """The same path with orientations between which what is held does not swing; see `level_rotations`."""
+    poses = np.asarray(path.matrices, float)
+    angles = Rotation.from_matrix(poses[0, :3, :3].T @ poses[:, :3, :3]).magnitude()
+    if angles[-1] < 1e-6:
+        return path
+    poses[:, :3, :3] = level_rotations(poses[0, :3, :3], poses[-1, :3, :3], angles / angles[-1])
+    return Trajectory.from_matrices(jnp.asarray(poses))
 
 
 def _pair(task: str, seed: int, number: int, target: Shape | Board | None):
@@ -293,6 +310,24 @@ def _start(one: Shape, poses: str, rng) -> np.ndarray:
     T[:2, 3] = [rng.uniform(*side) for side in OBJECTS]
     T[2, 3] = ABOVE - (one.mesh.vertices @ T[:3, :3].T)[:, 2].min()
     return T
+
+
+def _turned(grip: Grip, T_world_object) -> list[Grip]:
+    """A grasp, turned about the axis of a round object to where the object swings least in the hand, the best first.
+
+    That is where the closing direction is in the vertical plane of a tilted object's axis.
+    """
+    up = T_world_object[2, :3]
+    if grip.fold != ROUND or np.hypot(up[0], up[1]) < UPRIGHT:
+        return [grip]
+    closing = grip.T_object_grip[:2, 1]
+    plane = np.arctan2(up[1], up[0]) - np.arctan2(closing[1], closing[0])
+    turned = []
+    for turn in plane + np.array(OFF_PLANE):
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_euler("z", turn).as_matrix()
+        turned.append(grip._replace(T_object_grip=T @ grip.T_object_grip))
+    return turned
 
 
 def _standing(mesh, area, rng) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
 from tdf_jax.sim import physics
@@ -77,3 +78,20 @@ def test_a_floating_hand_is_where_it_is_driven_to(robot, mug):
     np.testing.assert_allclose(cell.gripper_pose(hand.data), end, atol=1e-3)
     assert not hand.holds() and hand.penetration() == 0
     np.testing.assert_allclose(cell.body_pose(hand.data, OBJECT), T, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_a_heavy_tilted_bottle_is_held_in_the_plane_of_its_tilt_and_swings_across_it(robot):
+    """A cap that is a cone is touched at one ring, by a point of either pad; it swings when the fixture lets go."""
+    bottle = tdf.build_bottle(tdf.BottleParameters(cap_height=0.03, cap_radius=0.018, cap_taper=0.9))
+    body, grip = body_of(bottle, 0.3), grip_of(bottle, robot.fingers)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_euler("xz", (55, 40), degrees=True).as_matrix(), (0.5, 0, 0.3)
+    held = []
+    for turn in (0.0, 90.0):
+        about = np.eye(4)
+        about[:3, :3] = Rotation.from_euler("z", turn, degrees=True).as_matrix()
+        held.append(test_grasp(robot, body, T, T @ about @ grip.T_object_grip, grip.opening, fixture=True))
+    plane, across = held
+    assert plane.held and plane.slip < 0.006 and plane.turn < 4 and plane.pulled < 0.002
+    assert not across.held and across.slip > 0.03 and across.turn > 20

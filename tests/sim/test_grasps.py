@@ -7,8 +7,9 @@ import pytest
 
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
+from tdf_jax.geometry.symmetry import ROUND
 from tdf_jax.shapes import FAMILIES
-from tdf_jax.sim.grasps import grip_of
+from tdf_jax.sim.grasps import EDGE, TIPS, UNSTEADY, grip_of
 
 
 def drawn_shape(category, seed):
@@ -49,20 +50,52 @@ def test_a_mug_is_held_opposite_to_its_handle(robot, seed):
     assert abs(grip.T_object_grip[1, 3]) < 1e-9
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(4))
 def test_a_bottle_is_held_at_the_neck_from_above(robot, seed):
-    bottle = drawn_shape("bottle", seed)
-    grip = grip_of(bottle, robot.fingers)
+    bottle, fingers = drawn_shape("bottle", seed), robot.fingers
+    grip = grip_of(bottle, fingers)
     T = grip.T_object_grip
     np.testing.assert_allclose(T[:3, 2], (0, 0, -1), atol=1e-9)
     np.testing.assert_allclose(T[:2, 3], 0, atol=1e-9)
-    neck = between(bottle, grip, robot.fingers)
-    assert abs(neck.mean()) < 1e-3
-    # The widest of what is between the fingers, over the length of the pads.
-    inside = [between(bottle, grip, robot.fingers, depth) for depth in np.linspace(-0.018, 0.018, 19)]
-    assert max(np.ptp(part) for part in inside if len(part)) == pytest.approx(grip.width, abs=0.003)
-    # The tips, even those of open fingers, are above the table.
-    assert T[2, 3] - robot.fingers.depth(grip.opening) - 0.0187 > bottle.mesh.bounds[0, 2]
+    # The widest of what is between the pads, from their tips over their length.
+    tips = fingers.tip(grip.width) - fingers.depth(grip.width)
+    inside = [between(bottle, grip, fingers, tips - back) for back in np.linspace(0, 2 * TIPS, 40)]
+    spans = np.array([np.ptp(part) if len(part) else 0.0 for part in inside])
+    assert spans.max() == pytest.approx(grip.width, abs=0.0015)
+    assert abs(inside[int(spans.argmax())].mean()) < 1e-3
+    # Open fingers pass beside all that is above their tips, by 6 mm at least.
+    above = [between(bottle, grip, fingers, tips - back, 1201) for back in np.linspace(0, 0.055, 56)]
+    assert max(np.ptp(part) for part in above if len(part)) < grip.opening - 0.0119
+    assert grip.opening <= fingers.widest + 1e-9
+    # They end above the table.
+    assert T[2, 3] - fingers.tip(grip.width) > bottle.mesh.bounds[0, 2] + 0.02
+
+
+def test_pads_touch_a_cap_at_its_widest_ring_and_a_straight_neck_along_its_length(robot):
+    fingers = robot.fingers
+    cone = tdf.build_bottle(tdf.BottleParameters(cap_height=0.03, cap_radius=0.020, cap_taper=0.5))
+    grip = grip_of(cone, fingers)
+    assert grip.width == pytest.approx(0.040, abs=0.001)  # not higher on the cone, off which pads slide
+    ring = cone.mesh.bounds[1, 2] - 0.03
+    above_tips = ring - (grip.T_object_grip[2, 3] - fingers.tip(grip.width))
+    assert EDGE - 0.001 < above_tips < UNSTEADY + 0.001
+    long = tdf.build_bottle(tdf.BottleParameters(cap_height=0.0, shoulder_bottom=0.11, shoulder_top=0.14))
+    grip = grip_of(long, fingers)
+    assert grip.width == pytest.approx(0.028, abs=0.001)
+    tips = grip.T_object_grip[2, 3] - fingers.tip(grip.width)
+    assert 0.14 - long.height / 2 < tips < long.mesh.bounds[1, 2] - 2 * TIPS + 0.001  # all of the pads
+
+
+def test_a_grasp_of_a_round_neck_is_the_same_at_every_turn(robot):
+    flat = tdf.build_bottle(tdf.BottleParameters(aspect=0.6))
+    assert grip_of(flat, robot.fingers).fold == ROUND  # its body is flat, its neck is not
+    assert grip_of(tdf.build_mug(), robot.fingers).fold == 1
+    # A flat bottle whose fingers reach below the shoulder everywhere is held across its narrow side alone.
+    stub = tdf.build_bottle(
+        tdf.BottleParameters(height=0.12, aspect=0.6, shoulder_bottom=0.108, shoulder_top=0.113, cap_height=0.004)
+    )
+    grip = grip_of(stub, robot.fingers)
+    assert grip.fold == 1 and grip.width == pytest.approx(0.6 * 0.072, abs=0.004)
 
 
 def test_what_has_no_grasp_is_refused(robot):

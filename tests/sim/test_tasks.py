@@ -3,10 +3,14 @@
 import numpy as np
 import pytest
 from conftest import angle
+from scipy.spatial.transform import Rotation
 
+import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
+from tdf_jax.geometry.symmetry import ROUND
 from tdf_jax.sim import tasks
 from tdf_jax.sim.kinematics import kinematics_of
+from tdf_jax.sim.swing import swing_arm
 from tdf_jax.sim.tasks import ABOVE, OBJECTS, TARGETS, TASKS, demonstrate_episode, draw_episode
 
 
@@ -92,6 +96,7 @@ def test_a_demonstration_leads_from_the_true_pick_to_the_true_release(drawn, tas
         np.testing.assert_allclose(T[:3, 3], true[:3, 3], atol=1e-5)
         assert angle(T, true) < 0.05
     # Its clouds lie on the object and the target, where they are.
+    assert demonstration.target is not None
     for shape, T, points in (
         (episode.object, episode.T_world_object, demonstration.points),
         (episode.target, episode.T_world_target, demonstration.target.points),
@@ -117,6 +122,41 @@ def test_what_nothing_fits_around_is_drawn_again(robot, drawn, monkeypatch):
     monkeypatch.setattr(tasks, "grip_of", too_wide_once)
     episode = draw_episode("bowl_on_shelf", robot, 900, 0)
     assert episode.redrawn == 1 and len(calls) == 2 and calls[1] is episode.object
+
+
+@pytest.mark.slow
+def test_a_tilted_bottle_is_picked_in_the_plane_of_its_tilt(robot, drawn):
+    episode = drawn("bottle_on_shelf", "tilt60")
+    assert episode.grip.fold == ROUND
+    axis, closing = episode.T_world_object[:3, 2], episode.pick[:3, 1]
+    normal = np.cross(axis, [0.0, 0, 1])
+    normal /= np.linalg.norm(normal)
+    assert np.degrees(np.arcsin(abs(closing @ normal))) < 10.1
+    # The same grasp as before but for the turn about the neck's axis.
+    plain = tasks.grip_of(episode.object, robot.fingers)
+    turn = episode.grip.T_object_grip @ np.linalg.inv(plain.T_object_grip)
+    np.testing.assert_allclose(turn[:3, 2], (0, 0, 1), atol=1e-9)
+    np.testing.assert_allclose(turn[:3, 3], 0, atol=1e-9)
+    # Along the demonstrated path the weight turns it little about the closing axis.
+    path = np.asarray(demonstrate_episode(episode, 0, points=60).trajectory.matrices, float)
+    centre = episode.T_world_object @ np.append(episode.object_body.centre, 1)
+    lever = np.linalg.norm(centre[:3] - episode.pick[:3, 3])
+    assert swing_arm(path, centre[:3]) < 0.2 * lever
+
+
+def test_a_round_grasp_is_turned_to_where_the_object_does_not_swing(robot):
+    grip = tasks.grip_of(tdf.build_bottle(), robot.fingers)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("zyx", (70, 35, -20), degrees=True).as_matrix()
+    turned = tasks._turned(grip, T)
+    assert len(turned) == 3
+    up = T[2, :3]
+    for one, off in zip(turned, (0, 10, 10)):
+        closing = one.T_object_grip[:3, 1]
+        across = np.cross((0, 0, 1), up) / np.linalg.norm(up[:2])
+        assert np.degrees(np.arcsin(abs(closing @ across))) == pytest.approx(off, abs=1e-6)
+    assert tasks._turned(grip, np.eye(4)) == [grip]  # upright nothing swings
+    assert tasks._turned(grip._replace(fold=1), T)[0].fold == 1 and len(tasks._turned(grip._replace(fold=1), T)) == 1
 
 
 def test_wrong_names_are_refused(robot):
