@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from tdf_jax.sim.replay import Replay
     from tdf_jax.sim.robot import Robot
 
-FORMAT = 3  # format number; raise it when what an episode computes changes
-REVISIONS = {"rigid replay": 1, "ICP": 1}  # changes of what a single method computes
+FORMAT = 4  # format number; raise it when what an episode computes changes
 DEMONSTRATIONS = 10  # episodes that demonstrate; with one demonstration, each is that of a tenth of the episodes
 FIRST_DEMONSTRATION = 1_000_000  # their numbers begin here, so that no episode shares their objects
 MOST_PROCESSES = 1024  # more are a mistake
@@ -219,7 +218,6 @@ def run_one(settings: Settings, number: int, view: bool = False) -> Run:
     condition = settings.condition
     bench = _bench(settings)
     about = [FORMAT, version("tdf_jax"), *bench.fingerprints, *bench.robot_content, *condition, settings.seed, number]
-    about += [REVISIONS[condition.method]] if condition.method in REVISIONS else []
     run = functools.partial(bench.run, number)
     if view:
         shown = bench.run(number, view=True)
