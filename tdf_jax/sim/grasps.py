@@ -11,7 +11,7 @@ from tdf_jax.shapes import Shape
 from tdf_jax.sim.robot import Fingers
 
 CLEARANCE = 0.018  # metres between each finger and the wall before closing
-NECK_CLEARANCE, LEAST_CLEARANCE = 0.010, 0.006  # of a neck, whose middle the cloud shows well
+NECK_CLEARANCE, LEAST_CLEARANCE = 0.010, 0.005  # of a neck, whose middle the cloud shows well
 RIM_DEPTH = 0.030  # metres from the rim down the wall to the tips of the fingers
 MOST_DEPTH = 0.6  # of the height of a low bowl
 NECK_DEPTHS = (0.012, 0.052)  # metres from a bottle's top to the tips; the palm is 0.055 m behind them

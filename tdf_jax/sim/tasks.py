@@ -47,7 +47,7 @@ BEHIND = 0.10  # metres behind the pick and the release, along the approach, whi
 SAME_POSTURE = 1.5  # radians, largest movement of a joint on the way there
 # Sine of the tilt from which a held object swings, and angles, radians, between the closing direction and the plane in
 # which it would not swing that are tried.
-UPRIGHT, OFF_PLANE = 0.02, tuple(np.radians([0.0, 10.0, -10.0]))
+UPRIGHT, OFF_PLANE = 0.02, tuple(np.radians([0.0, 5.0, -5.0]))
 SEARCHES = 12  # starts of the search for a posture of the arm at the true pick and at the true release
 
 

@@ -63,9 +63,9 @@ def test_a_bottle_is_held_at_the_neck_from_above(robot, seed):
     spans = np.array([np.ptp(part) if len(part) else 0.0 for part in inside])
     assert spans.max() == pytest.approx(grip.width, abs=0.0015)
     assert abs(inside[int(spans.argmax())].mean()) < 1e-3
-    # Open fingers pass beside all that is above their tips, by 6 mm at least.
+    # Open fingers pass beside all that is above their tips, by 5 mm at least.
     above = [between(bottle, grip, fingers, tips - back, 1201) for back in np.linspace(0, 0.055, 56)]
-    assert max(np.ptp(part) for part in above if len(part)) < grip.opening - 0.0119
+    assert max(np.ptp(part) for part in above if len(part)) < grip.opening - 0.0099
     assert grip.opening <= fingers.widest + 1e-9
     # They end above the table.
     assert T[2, 3] - fingers.tip(grip.width) > bottle.mesh.bounds[0, 2] + 0.02
