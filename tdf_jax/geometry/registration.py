@@ -17,6 +17,11 @@ SEARCHED = 20  # starts that are registered, those with the smallest distances
 # half edge. On 50 development racks these were 0 to 0.5 and 0.07 to 0.16; on 40 mugs and containers, where most such
 # poses are wrong, 0.52 and more.
 FITS_MUCH_BETTER, FITS_NEARLY = 0.5, 0.16
+# A region such as a peg's may fit as well after turns. They are tried about each axis, and what is around the region
+# decides: a cube so many times as large. A turned pose may fit a little worse.
+SURROUNDINGS = 3.0
+TURNS, AS_GOOD = np.radians(np.arange(30, 360, 30)), 1.4
+SMALL_TURNS, AS_GOOD_UNMOVED = np.radians([-20, -10, -5, 5, 10, 20]), 1.15
 
 
 def register_region(
@@ -74,7 +79,8 @@ def refine_regions(
 
     Each pose is registered from where it is. Where the two regions differ in size, as the rims of two mugs do, closest
     points would tilt a pose and not fit better: then it stays. If the first pose does not fit, and a registration from
-    any pose, shifted along its axes, fits far better, that takes its place.
+    any pose, shifted along its axes, fits far better, that takes its place. Where the region fits as well after a turn,
+    as a peg does about its axis, the points around it decide.
 
     Args:
         demonstrated: cloud in the frame of the region, (points, 3), metres.
@@ -90,18 +96,52 @@ def refine_regions(
     refined = np.stack([register_region(demonstrated, points, T, radius) for T in given])
     after = np.array([region_distance(demonstrated, points, T, radius) for T in refined])
     fits = after < np.minimum(FITS_BETTER * before, FITS * radius)
-    poses = np.where(fits[:, None, None], refined, given)
-    if min(before[0], after[0]) < FITS * radius:
-        return poses
+    if min(before[0], after[0]) >= FITS * radius:
+        other = _search(demonstrated, points, given, radius, FITS_MUCH_BETTER * before[0])
+        if other is not None:
+            refined[0], fits[0] = other, True
+    return np.stack(
+        [
+            _turned(demonstrated, points, pose, radius) if fit else start
+            for start, pose, fit in zip(given, refined, fits, strict=True)
+        ]
+    )
+
+
+def _search(demonstrated, points, given, radius: float, most: float) -> np.ndarray | None:
+    """The pose that fits best of those registered from the given ones, shifted; None if none fits well enough."""
     steps = radius * np.concatenate([np.zeros((1, 3)), np.kron(np.eye(3), np.array(SHIFTS)[:, None])])
     starts = np.repeat(given, len(steps), axis=0)
     starts[:, :3, 3] += (given[:, None, :3, :3] @ steps[..., None])[..., 0].reshape(-1, 3)
     nearest = np.argsort([region_distance(demonstrated, points, T, radius) for T in starts], kind="stable")[:SEARCHED]
     found = [register_region(demonstrated, points, starts[start], radius) for start in nearest]
     distances = [region_distance(demonstrated, points, T, radius) for T in found]
-    if min(distances) < min(FITS_MUCH_BETTER * before[0], FITS_NEARLY * radius):
-        poses[0] = found[int(np.argmin(distances))]
-    return poses
+    return found[int(np.argmin(distances))] if min(distances) < min(most, FITS_NEARLY * radius) else None
+
+
+def _turned(demonstrated, points, T: np.ndarray, radius: float) -> np.ndarray:
+    """Of a registered pose and those turned about its axes in which the region fits as well, what is around decides."""
+
+    def distance(pose, factor=1.0):
+        return region_distance(demonstrated, points, pose, factor * radius)
+
+    registered = [register_region(demonstrated, points, pose, radius) for pose in _turns(T, TURNS)]
+    as_good = [pose for pose in registered if distance(pose) <= AS_GOOD * distance(T)]
+    T = min([T, *as_good], key=lambda pose: distance(pose, SURROUNDINGS))
+    for _ in range(2):
+        as_good = [pose for pose in _turns(T, SMALL_TURNS) if distance(pose) <= AS_GOOD_UNMOVED * distance(T)]
+        T = min([T, *as_good], key=lambda pose: distance(pose, SURROUNDINGS))
+    return register_region(demonstrated, points, T, radius)  # what is around differs more than the region does
+
+
+def _turns(T: np.ndarray, angles) -> list[np.ndarray]:
+    """A pose turned about each of its axes by angles."""
+    from scipy.spatial.transform import Rotation
+
+    turned = np.tile(T, (3 * len(angles), 1, 1))
+    vectors = np.kron(np.eye(3), np.asarray(angles)[:, None])
+    turned[:, :3, :3] = T[:3, :3] @ Rotation.from_rotvec(vectors).as_matrix()
+    return list(turned)
 
 
 def region_distance(

@@ -83,7 +83,25 @@ def test_a_first_pose_that_fits_is_only_registered():
     given = _poses([0.006, 0.0, 0.004], [0.0, 0.0, 0.0])
     found = refine_regions(demonstrated, points, given, 0.04)
     expected = register_region(demonstrated, points, given[0], 0.04)
-    np.testing.assert_array_equal(found[0], expected)
+    np.testing.assert_allclose(found[0, :3, [0, 3]], expected[:3, [0, 3]].T, atol=0.02)  # about the peg it is free
+    assert np.linalg.norm(found[0, :3, 3]) < 0.002
+
+
+def test_points_around_the_region_decide_where_it_is_free():
+    """A peg is the same after a turn about its axis; a post beside it, outside the region, is not."""
+    rng = np.random.default_rng(6)
+
+    def scene():
+        post = rng.uniform(-1, 1, (400, 3)) * [0.01, 0.01, 0.05] + [0.0, 0.0, -0.11]
+        return np.concatenate([_peg(rng), post])
+
+    demonstrated, points = scene(), scene()
+    for degrees in (40, 160):
+        given = _poses([0.004, 0.002, 0.003])
+        given[0, :3, :3] = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+        found = refine_regions(demonstrated, points, given, 0.04)[0]
+        assert np.degrees(np.arccos(found[2, 2])) < 12
+        assert np.linalg.norm(found[:3, 3]) < 0.003
 
 
 def test_a_region_of_another_size_stays_where_it_is():
