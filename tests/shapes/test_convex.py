@@ -203,7 +203,7 @@ def volume_ratio(shape, parts, rng, count=20000):
 @pytest.mark.slow
 @pytest.mark.parametrize("category", FAMILIES)
 def test_parts_of_sampled_objects_are_few_and_close_and_have_their_volume(category):
-    for seed in range(15):
+    for seed in range(4):
         shape, rng = sampled(seed, category), np.random.default_rng(seed)
         parts = assert_right(shape, rng, 500)
         # Flat faces fill a round wall by 0.1 mm on average, which is more than 3 % of a thin one.
