@@ -80,7 +80,7 @@ def test_a_run_is_resumed(first, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [one for one in campaign.METHODS if one != campaign.LIBRARY])  # whole runs below
+@pytest.mark.parametrize("method", [one for one in campaign.METHODS if one != campaign.LIBRARY])  # it has whole runs
 def test_every_method_gives_a_path_and_a_motion(robot, tmp_path, method):
     bench = campaign._Bench(settings(tmp_path, SHELF._replace(method=method, mass=0.01)))
     episode, shown = bench.episode(4)
