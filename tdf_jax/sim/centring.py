@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from tdf_jax.sim.grasps import TIPS
+from tdf_jax.sim.grasps import NECK_CLEARANCE, TIPS
 from tdf_jax.sim.robot import Fingers
 
 BESIDE = 0.014  # metres, half width of the region between the fingers, along x
@@ -13,6 +13,7 @@ LEAST = 8  # points; with fewer the grasp stays as it is
 STEEPEST = np.radians(40)  # a steeper wall is another surface
 LONGEST = 0.015  # metres, largest movement along the closing direction
 ROUNDS = 4
+MISFIT = 0.0025  # metres, of points from two parallel lines
 SPREAD = 0.006  # metres along the approach that the points must span for a slope
 
 
@@ -38,11 +39,16 @@ def centred(
     """
     T = np.array(T_world_grip, float)
     tips = fingers.depth(0.0) + TIPS
+    shorter = fingers.tip(max(opening - 2 * NECK_CLEARANCE, 0.0))
     for _ in range(ROUNDS):
         x, y, z = _local(T, points)
         between = (np.abs(x) < BESIDE) & (np.abs(y) < opening / 2) & (z > tips - BEHIND) & (z < tips + BEYOND)
         if between.sum() < LEAST:
             return T
+        # Below a neck is the shoulder, which is no wall: then what is between the pads alone counts.
+        pads = between & (z < shorter + BEYOND)
+        if pads.sum() >= LEAST and _misfit(y[between], z[between]) > MISFIT:
+            between = pads
         y, z = y[between], z[between]
         slope, middle = _line(y, z)
         angle = float(np.clip(np.arctan(slope), -STEEPEST, STEEPEST))
@@ -57,6 +63,13 @@ def centred(
 
 def _local(T, points):
     return ((np.asarray(points, float) - T[:3, 3]) @ T[:3, :3]).T
+
+
+def _misfit(y, z) -> float:
+    """Root of the mean squared distance, metres, of points from two lines parallel to their middle line."""
+    slope, offset = _line(y, z)
+    half = np.abs(y - offset - slope * z)
+    return float(half.std())
 
 
 def _line(y, z) -> tuple[float, float]:

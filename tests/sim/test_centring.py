@@ -16,8 +16,8 @@ def held(request, robot):
     family = FAMILIES[category]
     shape = family.build(family.sample(np.random.default_rng(seed)))
     cloud = sample_surface(shape.mesh, 1500, np.random.default_rng(3))
-    # A neck narrows and is seen by few points: its line is known to a few degrees.
-    return cloud, grip_of(shape, robot.fingers), (6, 2e-3) if category == "bottle" else (3, 1.5e-3)
+    # A neck narrows, ends in a shoulder and is seen by few points: its line is known to ten degrees.
+    return cloud, grip_of(shape, robot.fingers), (10, 3e-3) if category == "bottle" else (3, 1.5e-3)
 
 
 def moved_grip(T, degrees, shift, fingers):
