@@ -24,6 +24,7 @@ from tdf_jax.energy.seating import touch_distance
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration, check_apart
 from tdf_jax.geometry.registration import refine_regions
+from tdf_jax.geometry.sampling import subset
 from tdf_jax.geometry.trajectory import Trajectory, resample
 from tdf_jax.geometry.transport import arrival_depth, carry_to_target
 from tdf_jax.networks.encoding import encode
@@ -46,6 +47,7 @@ MAX_TOUCH_DISTANCE = 0.01
 # Half edge of the region that is registered, a factor on the spread of the contact points along an axis: of points in a
 # box, 0.8 of its edge.
 REGION = 1.4
+REGISTERED = 4000  # most points of a cloud that are registered; more would cost up to minutes
 MAX_SOLUTIONS = 25  # candidates of a result: distinct picks times distinct motions of the object
 
 
@@ -75,10 +77,11 @@ class Relations:
     Attributes:
         target_contacts: poses X_t of the contact frame on the target, world frame, (solutions, 7).
         object_contacts: poses X_o of the contact frame on the object in its initial pose, world frame, (solutions, 7).
-        energies: sum of the descriptor energies of both, (solutions,).
+        energies: sum of the descriptor energies of both, (solutions,); on the target before registration.
         seatings: displacements of the object after both regions are brought together, so that it touches the target,
             world frame, (solutions, 3), metres; NaN where it is not seated.
-        target_residual: residual of the best contact pose on the target; NaN if the target has not moved.
+        target_residual: residual of the best contact pose on the target before registration; NaN if the target has not
+            moved.
     """
 
     target_contacts: Float[np.ndarray, "solutions 7"]
@@ -275,8 +278,14 @@ def find_relations(
             target_key,
             config,
         )
-        on_target = _registered(on_target, contact, np.asarray(objects.target_points))
         residual = pick_residual(float(target_energies[0]), contact.target_descriptors)
+        on_target = _registered(on_target, contact, np.asarray(objects.target_points))
+        # Several may now be one.
+        modes = cluster_poses(jnp.asarray(on_target), jnp.asarray(target_energies))
+        on_target, target_energies = (
+            np.stack([mode.pose for mode in modes]),
+            np.array([mode.energy for mode in modes], np.float32),
+        )
     energies = target_energies[:, None] + object_energies
     order = np.argsort(energies, axis=None, kind="stable")[:MAX_SOLUTIONS]
     rows, columns = np.unravel_index(order, energies.shape)
@@ -298,7 +307,8 @@ def _registered(
     T_contact_region[:3, 3] = query.mean(axis=0)
     radius = REGION * float(np.sqrt(np.mean((query - query.mean(axis=0)) ** 2)))
     T_region_world = np.linalg.inv(_matrix(contact.T_world_contact) @ T_contact_region)
-    demonstrated = np.asarray(contact.target_points, float) @ T_region_world[:3, :3].T + T_region_world[:3, 3]
+    shown, points = (subset(np.asarray(cloud, float), REGISTERED) for cloud in (contact.target_points, points))
+    demonstrated = shown @ T_region_world[:3, :3].T + T_region_world[:3, 3]
     given = np.stack([_matrix(pose) @ T_contact_region for pose in contacts])
     refined = refine_regions(demonstrated, points, given, radius)
     back = np.linalg.inv(T_contact_region)

@@ -1,8 +1,7 @@
 """Seating: how far an object is lowered or raised until it touches its target, by the occupancies of both.
 
-The level of a half of a field is up to some millimetres off the surface, more so at thin parts. The cloud says where
-the surface is: so a point touches an object where its occupancy reaches what the field has at the nearest points of
-the object's cloud.
+An occupancy of one half lies up to some millimetres off the surface, more at thin parts. The points of a cloud lie on
+the surface. So a point touches an object where its occupancy reaches that at the nearest points of the object's cloud.
 """
 
 import jax.numpy as jnp
@@ -10,13 +9,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tdf_jax.geometry import se3
+from tdf_jax.geometry.sampling import subset
 from tdf_jax.networks.field import DescriptorField
 
 REACH = 0.015  # metres; an object that touches nothing within it is not moved
-STEPS = 15  # tested displacements each way; between them the occupancy is interpolated
+STEPS = 15  # tested displacements each way; between them the depth is interpolated
 LEVEL_POINTS = 4  # nearest points of a cloud, by which the occupancy at its surface is known
 SEEN = 0.012  # metres from the cloud within which its points say where the surface is
-UNSEEN_LEVEL = 0.5  # occupancy that counts as touching elsewhere
+UNSEEN_LEVEL = 0.5  # occupancy that counts as touching elsewhere, within the limits below
 # Limits of the occupancy that counts as touching. In the target's field, where the object's points are tested, only
 # what is clearly inside counts: those of racks have shadows of a half beside their pegs.
 OBJECT_LEVELS, TARGET_LEVELS = (0.1, 0.9), (0.7, 0.95)
@@ -58,23 +58,16 @@ def touch_distance(
     R, t = np.asarray(se3.rotation(jnp.asarray(motion)), float), np.asarray(motion, float)[4:]
     direction, target_points = np.asarray(direction, float), np.asarray(target_points, float)
     placed = np.asarray(points, float) @ R.T + t
-    near, target_near = _meeting(_denser(_thinned(placed)), _denser(_thinned(target_points)), direction)
+    near, target_near = _meeting(_denser(subset(placed, CLOUD)), _denser(subset(target_points, CLOUD)), direction)
     if not len(near):
         return np.nan
     steps = np.linspace(-REACH, REACH, 2 * STEPS + 1)
     shifts = steps[:, None, None] * direction
-    cloud = _thinned(np.asarray(points, float))
+    cloud = subset(np.asarray(points, float), CLOUD)
     depths = [_depth(field, cloud, (target_near - shifts - t) @ R, OBJECT_LEVELS)]
     if target is not None:
-        depths.append(_depth(target, _thinned(target_points), near + shifts, TARGET_LEVELS))
+        depths.append(_depth(target, subset(target_points, CLOUD), near + shifts, TARGET_LEVELS))
     return _first_touch(steps, np.max(depths, axis=0))
-
-
-def _thinned(points: np.ndarray) -> np.ndarray:
-    """At most `CLOUD` points, the same for the same cloud."""
-    if len(points) <= CLOUD:
-        return points
-    return points[np.sort(np.random.default_rng(0).choice(len(points), CLOUD, replace=False))]
 
 
 def _denser(points: np.ndarray) -> np.ndarray:

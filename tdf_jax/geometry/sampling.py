@@ -36,6 +36,21 @@ def thin(points: Float[np.ndarray, "points 3"], count: int) -> Float[np.ndarray,
     return points if len(indices) == len(points) else points[indices]
 
 
+def subset(points: Float[np.ndarray, "points 3"], count: int) -> Float[np.ndarray, "subset 3"]:
+    """Reduce a cloud to points drawn at random, the same for the same cloud; far faster than `thin` on large clouds.
+
+    Args:
+        points: point cloud, (points, 3), metres.
+        count: number of points in the subset.
+
+    Returns:
+        The subset, (count, 3), in the order of the cloud; the cloud itself if it has at most `count` points.
+    """
+    if len(points) <= count:
+        return points
+    return points[np.sort(np.random.default_rng(0).choice(len(points), count, replace=False))]
+
+
 @public
 def drop_invalid(points: Float[np.ndarray, "*grid 3"]) -> Float[np.ndarray, "points 3"]:
     """Remove the rows of a cloud that are no measurements.

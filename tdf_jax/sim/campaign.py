@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from tdf_jax.sim.replay import Replay
     from tdf_jax.sim.robot import Robot
 
-FORMAT = 4  # format number; raise it when what an episode computes changes
+FORMAT = 5  # format number; raise it when what an episode computes changes
 DEMONSTRATIONS = 10  # episodes that demonstrate; with one demonstration, each is that of a tenth of the episodes
 FIRST_DEMONSTRATION = 1_000_000  # their numbers begin here, so that no episode shares their objects
 MOST_PROCESSES = 1024  # more are a mistake
