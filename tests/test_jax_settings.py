@@ -464,7 +464,9 @@ def test_pure_functions_in_transformations_under_all_settings(world, name):
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_needs_known_numbers_is_refused_by_name(world, name, transform):
     function, argument = REFUSED[name]
-    x, _ = getattr(world, argument), (world.box, world.near, world.landscape)  # made before anything is traced
+    x = getattr(world, argument)
+    for needed in ("box", "near", "landscape", "vector", "steps", "openings", "limits"):
+        getattr(world, needed)  # made before anything is traced
     with pytest.raises(tdf.InputError, match=rf"{name}\(\): .* traced by jax.jit"):
         transform(lambda x: function(world, x))(jnp.stack([x, x]) if transform is jax.vmap else x)
 
