@@ -323,6 +323,7 @@ def test_into_a_deeper_target_the_object_comes_from_farther_out():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::tdf_jax.CategoryWarning")  # a false alarm: the mug is half as large as the other
 def test_the_shipped_weights_place_an_unseen_bowl_on_an_unseen_mug():
     bowl, mug = tdf.load_model("bowl"), tdf.load_model("mug")
     shown, pair = (draw_pair("bowl_on_mug", 901, number) for number in (1000, 0))
