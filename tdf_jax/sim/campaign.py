@@ -218,11 +218,9 @@ def run_one(settings: Settings, number: int, view: bool = False) -> Run:
     condition = settings.condition
     bench = _bench(settings)
     about = [FORMAT, version("tdf_jax"), *bench.fingerprints, *bench.robot_content, *condition, settings.seed, number]
-    run = functools.partial(bench.run, number)
-    if view:
-        shown = bench.run(number, view=True)
-        run = lambda: shown  # noqa: E731
-    result = kept("tdf simulate", settings.folder, about, run)
+    # A viewed episode runs, also if its outcome is kept.
+    viewed = bench.run(number, view=True) if view else None
+    result = kept("tdf simulate", settings.folder, about, lambda: bench.run(number) if viewed is None else viewed)
     fields = {field.name: result[field.name].item() for field in dataclasses.fields(Outcome)}
     imitation, executed, *planning = map(float, result["seconds"])
     drawn = int(result["rejected"]), int(result["redrawn"])

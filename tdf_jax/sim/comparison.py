@@ -80,7 +80,10 @@ class Row:
         """Median movement in the hand after closing, metres and degrees; None if nothing was held."""
         moved = np.array([(one.outcome.slip, one.outcome.turn) for one in self.runs], float)
         moved = moved[np.isfinite(moved).all(axis=1)]
-        return None if not len(moved) else tuple(float(one) for one in np.median(moved, axis=0))  # type: ignore[return-value]
+        if not len(moved):
+            return None
+        slip, turn = np.median(moved, axis=0)
+        return float(slip), float(turn)
 
     def drawn(self) -> tuple[int, int]:
         """Numbers of starts out of reach and of pairs that do not fit, drawn before the episodes."""
