@@ -1,6 +1,7 @@
 """Imitate a demonstrated pick-and-place trajectory on new objects: Trajectory Descriptor Fields in JAX.
 
     mesh or cloud file --load_mesh, load_points, sample_surface--> points
+    depth image --points_from_depth, separate_objects--> points
     points --encode--> DescriptorField
     Demonstration (points, trajectory, query points) --describe--> Reference
     DescriptorField + Reference --carry, solve or optimize--> Result, whose `.trajectory` is the best one
@@ -94,6 +95,10 @@ from tdf_jax.networks.model import Model as Model, ModelInfo as ModelInfo
 from tdf_jax.networks.ndf_checkpoint import convert_checkpoint as convert_checkpoint
 from tdf_jax.networks.occupancy import NetworkConfig as NetworkConfig
 from tdf_jax.networks.refinement import refine as refine
+from tdf_jax.perception.clusters import separate_objects as separate_objects
+from tdf_jax.perception.depth import points_from_depth as points_from_depth
+from tdf_jax.perception.outliers import remove_outliers as remove_outliers
+from tdf_jax.perception.support import remove_plane as remove_plane
 from tdf_jax.planning.avoidance import ClearanceConfig as ClearanceConfig, push_clear as push_clear
 from tdf_jax.planning.distances import clearance as clearance
 from tdf_jax.planning.occupied import field_obstacle as field_obstacle
@@ -204,6 +209,7 @@ __all__ = [
     "path_grid",
     "plan_joints",
     "plane_grid",
+    "points_from_depth",
     "pose_covariance",
     "pose_descriptor",
     "push_clear",
@@ -212,6 +218,8 @@ __all__ = [
     "Reference",
     "refine",
     "relate",
+    "remove_outliers",
+    "remove_plane",
     "resample",
     "Result",
     "retime",
@@ -228,6 +236,7 @@ __all__ = [
     "save_model",
     "save_trajectory",
     "semicircle",
+    "separate_objects",
     "SizeWarning",
     "snapped_query",
     "solve",

@@ -8,6 +8,7 @@ Modules:
     decomposition: convex parts of users' meshes, and the bodies that they make
     workcell: the table, an arm or a floating gripper, the object and the target
     cameras: depth cameras around a cell, and clouds of what they see
+    removal_study: what the removal of a table and of flying pixels costs
     kinematics: inverse kinematics of an arm, at a pose and along a path
     posture: the distinct positions of the joints with which the gripper is at a pose
     collision: what touches what at planned positions
