@@ -95,6 +95,7 @@ from tdf_jax.networks.model import Model as Model, ModelInfo as ModelInfo
 from tdf_jax.networks.ndf_checkpoint import convert_checkpoint as convert_checkpoint
 from tdf_jax.networks.occupancy import NetworkConfig as NetworkConfig
 from tdf_jax.networks.refinement import refine as refine
+from tdf_jax.perception.choice import pick_object as pick_object
 from tdf_jax.perception.clusters import separate_objects as separate_objects
 from tdf_jax.perception.depth import points_from_depth as points_from_depth
 from tdf_jax.perception.outliers import remove_outliers as remove_outliers
@@ -207,6 +208,7 @@ __all__ = [
     "optimize",
     "OptimizeConfig",
     "path_grid",
+    "pick_object",
     "plan_joints",
     "plane_grid",
     "points_from_depth",

@@ -33,7 +33,7 @@ from tdf_jax.uncertainty.doubt import DOUBT, warn_of_category, warn_of_target
 def imitate(
     model: Model,
     demonstration: Demonstration | Sequence[Demonstration] | Reference,
-    points: Float[Array | np.ndarray, "points 3"],
+    points: Float[Array | np.ndarray, "points 3"] | Sequence[Float[Array | np.ndarray, "_ 3"]],
     *,
     target_points: Float[Array | np.ndarray, "target_points 3"] | None = None,
     target_model: Model | None = None,
@@ -58,7 +58,8 @@ def imitate(
     Args:
         model: the network.
         demonstration: one, several with the same query points, or a `Reference` from `describe` to share between calls.
-        points: point cloud of the new object, (points, 3), metres, world frame.
+        points: point cloud of the new object, (points, 3), metres, world frame; or a list of several views of it in one
+            world frame, which are merged.
         target_points: point cloud of the new target, (points, 3), metres, world frame, if the demonstration has one.
             Without it the demonstrated target has not moved, and the object is placed there.
         target_model: network of the targets; by default `model`. A demonstrated target that has not moved needs none;
@@ -98,6 +99,7 @@ def imitate(
         )
     checks.boolean("imitate()", "fix_last", fix_last)
     checks.boolean("imitate()", "seat", seat)
+    points = _merged(points)
     reference = reference_of("imitate()", model, demonstration, target_points, target_model)
     if reference.contact is not None:
         given = {"goal": goal is not None, "goal_offset": goal_offset is not None, "fix_last=False": not fix_last}
@@ -129,6 +131,14 @@ def imitate(
     if isinstance(config, OptimizeConfig):
         return optimize(field, reference, key, energy=weights, config=config, **settings)
     return solve(field, reference, key, energy=weights, config=config, **settings)
+
+
+def _merged(points):
+    """One cloud of several views; anything else as it is."""
+    if not isinstance(points, list | tuple) or not points or not all(np.ndim(view) == 2 for view in points):
+        return points
+    views = [np.asarray(checks.coordinates("imitate()", f"points[{index}]", view)) for index, view in enumerate(points)]
+    return np.concatenate(views)
 
 
 def _judged(result: Result, weights: str, field, points) -> Result:

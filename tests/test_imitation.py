@@ -45,6 +45,12 @@ def test_a_reference_can_be_shared_between_calls(imitate, demonstration, result,
     assert_equal(imitate([demonstration]), result)
 
 
+def test_several_views_are_merged(imitate, reference, result):
+    assert_equal(imitate(reference, points=[TARGET[:15], TARGET[15:]]), result)
+    with pytest.raises(InputError, match=r"imitate\(\): points\[1\] has shape \(5, 2\)"):
+        imitate(reference, points=[TARGET, TARGET[:5, :2]])
+
+
 def test_several_demonstrations(imitate, small_model, demonstration, result):
     other = dataclasses.replace(demonstration, points=random_cloud(7).astype(np.float32))
     both = imitate([demonstration, other])

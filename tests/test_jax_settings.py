@@ -195,6 +195,9 @@ CALLS = {
     "mesh_obstacle": lambda w: tdf.mesh_obstacle(w.mesh, 0.05),
     "optimize": lambda w: tdf.optimize(w.field, w.reference, KEY, config=ADAM),
     "path_grid": lambda w: tdf.path_grid(w.path, 0.1, 0.05).points,
+    "pick_object": lambda w: tdf.pick_object(
+        w.model, [w.cloud, w.points], w.reference, config=CARRY, return_choice=True
+    ),
     "plan_joints": lambda w: (lambda moved: moved.positions[[0, len(moved.times) // 2]])(
         tdf.plan_joints(w.reached, w.arm, approach=w.short)
     ),
@@ -257,7 +260,7 @@ NO_CALL = {
 PHYSICS = ("load_robot", "plan_joints", "retime")
 # Draws of other numbers where float64 is allowed, and what starts from them.
 RANDOM = {"box_query", "carry", "contact_query", "gaussian_query", "gripper_query", "imitate", "imitate_batch"}
-RANDOM |= {"optimize", "relate", "solve"}
+RANDOM |= {"optimize", "pick_object", "relate", "solve"}
 # Those whose programs are small, or those of other tests, run with the fast ones.
 FAST = ("Result", "box_query", "carry", "cluster_poses", "describe", "encode", "imitate", "load_model")
 FAST += ("load_trajectory", "path_grid", "plane_grid", "confidence", "thin", "turns")
@@ -404,6 +407,7 @@ REFUSED = {
     "load_robot": (lambda w, x: tdf.load_robot(home=x), "vector"),
     "lowest_cost_path": (lambda w, x: tdf.lowest_cost_path(w.landscape, x, (0, 0, 0)), "vector"),
     "optimize": (lambda w, x: tdf.optimize(w.field, w.reference, KEY, starts=x[None]), "poses"),
+    "pick_object": (lambda w, x: tdf.pick_object(w.model, [x], w.reference, config=CARRY), "shown"),
     "plan_joints": (lambda w, x: tdf.plan_joints(tdf.Trajectory(x), None), "poses"),
     "path_grid": (lambda w, x: tdf.path_grid(tdf.Trajectory(x), 0.1, 0.05), "poses"),
     "plane_grid": (lambda w, x: tdf.plane_grid(0.1, origin=x), "vector"),
