@@ -3,6 +3,7 @@
 import dataclasses
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -99,7 +100,7 @@ def imitate(
         )
     checks.boolean("imitate()", "fix_last", fix_last)
     checks.boolean("imitate()", "seat", seat)
-    points = _merged(points)
+    cloud = _merged(points)
     reference = reference_of("imitate()", model, demonstration, target_points, target_model)
     if reference.contact is not None:
         given = {"goal": goal is not None, "goal_offset": goal_offset is not None, "fix_last=False": not fix_last}
@@ -109,16 +110,16 @@ def imitate(
                 f"imitate(): {contradicting or 'config is ' + type(config).__name__}, and the demonstration has a "
                 "target, which gives the goal; expected no goal and a CarryConfig. Drop one of them"
             )
-    field = encode(model, points)
+    field = encode(model, cloud)
     if reference.contact is not None:
-        objects = Objects(points, target_points, field, target_field(model, reference, target_points, target_model))
-        check_scene("imitate()", points, target_points, reference)
+        objects = Objects(cloud, target_points, field, target_field(model, reference, target_points, target_model))
+        check_scene("imitate()", cloud, target_points, reference)
         search = {"config": config, "seat": seat, "progress": progress, "device_mesh": device_mesh}
         result = carry_object(objects, reference, key, **search)
         if target_points is not None:
             weights = (model if target_model is None else target_model).info.name
             warn_of_target("imitate()", float(result.target_residual), weights, objects.target, target_points)
-        return _judged(result, model.info.name, field, points)
+        return _judged(result, model.info.name, field, cloud)
     goal = None if goal is None else jnp.asarray(checks.pose("imitate()", "goal", goal), float)
     if goal_offset is not None:
         goal = default_goal(field, reference) if goal is None else goal
@@ -126,14 +127,14 @@ def imitate(
     settings = {"goal": goal, "fix_last": fix_last, "progress": progress, "device_mesh": device_mesh}
     if isinstance(config, CarryConfig):
         result = carry(field, reference, key, config=config, **settings)
-        return _judged(result, model.info.name, field, points)
+        return _judged(result, model.info.name, field, cloud)
     weights = EnergyWeights() if energy is None else energy
     if isinstance(config, OptimizeConfig):
         return optimize(field, reference, key, energy=weights, config=config, **settings)
     return solve(field, reference, key, energy=weights, config=config, **settings)
 
 
-def _merged(points):
+def _merged(points) -> Any:
     """One cloud of several views; anything else as it is."""
     if not isinstance(points, list | tuple) or not points or not all(np.ndim(view) == 2 for view in points):
         return points

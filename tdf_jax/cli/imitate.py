@@ -17,6 +17,7 @@ import tdf_jax
 from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file, replace_folder
+from tdf_jax.cli.camera import choose, read_scene, table as cluster_table
 from tdf_jax.cli.options import Settings, make_scene, resolved
 from tdf_jax.cli.pictures import Pictures
 from tdf_jax.cli.tasks import TaskScene, make_task, not_judged
@@ -53,6 +54,8 @@ def imitate(settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()) 
     pictures = Pictures("tdf imitate")
     with replace_folder("tdf imitate", settings.out, RESULT, NAMES) as folder:
         record = _run(settings, folder, pictures)
+    if settings.clusters and not settings.json:
+        print(cluster_table(record["camera"]))
     print(json.dumps(record, indent=1) if settings.json else _table(record, settings.out))
     pictures.check()
 
@@ -69,12 +72,22 @@ def _run(settings: Settings, folder: Path, pictures: Pictures) -> dict:
             energy = EnergyWeights() if settings.k is None else EnergyWeights(settings.k)
         model = load_model(str(settings.weights))  # `resolved` has put the name of the category's weights
         target_model, target_points = _target(settings, model)
+        seen = read_scene(settings)
         task = None if settings.task is None else make_task(settings)
-        scene = make_scene(settings, query_key) if task is None else task.scene
+        first = None if seen is None else seen.clouds[0]
+        scene = make_scene(settings, query_key, first) if task is None else task.scene
         target_points = target_points if task is None else task.target_points
+    camera = None
+    if seen is not None:
+        with _timed(seconds, "choose"):
+            search = config if isinstance(config, CarryConfig) else CarryConfig()
+            points, found, camera = choose(settings, seen, model, target_model, scene.demonstration, search)
+            scene = dataclasses.replace(scene, points=points)
+            if found is not None:
+                target_points, target_model = found, model if target_model is None else target_model
+    with _timed(seconds, "encode"):
         related = scene.demonstration.target is not None
         offset = None if related and not any(settings.goal_offset) else settings.goal_offset
-    with _timed(seconds, "encode"):
         reference = jax.block_until_ready(describe(model, scene.demonstration, target_model=target_model))
     steps = config.solver.num_steps if isinstance(config, CarryConfig) else config.num_steps
     # The regions on the object and on a new target are found before the pick, and report no steps.
@@ -101,7 +114,7 @@ def _run(settings: Settings, folder: Path, pictures: Pictures) -> dict:
             rows = "start" if isinstance(config, OptimizeConfig) else "candidate"
             _draw(folder, scene, target_points, result, rows, relation, pictures)
     seconds["total"] = time.perf_counter() - began
-    record = _record(settings, model, scene, energy, config, result, relation, seconds)
+    record = _record(settings, model, scene, energy, config, result, relation, camera, seconds)
     replace_file("tdf imitate", folder / RESULT, json.dumps(record, indent=1).encode())
     return record
 
@@ -236,6 +249,7 @@ def _record(
     config: CarryConfig | SolveConfig | OptimizeConfig,
     result: Result,
     relation: dict | None,
+    camera: dict | None,
     timings: dict[str, float],
 ) -> dict:
     """Everything about a run that result.json holds; numbers that are not finite are null."""
@@ -258,6 +272,7 @@ def _record(
             "queries": len(demonstration.query),
         },
         "target": {"points": len(scene.points), "T_world_target": scene.T_world_target.tolist()},
+        **({} if camera is None else {"camera": camera}),
         "status": result.status,
         "best": result.best,
         "loss": {"start": float(result.candidate_history[result.best, 0]), "end": result.loss},
@@ -313,6 +328,12 @@ def _table(record: dict, out: Path) -> str:
         rows["object moves"] = f"{100 * relation['moved_metres']:.1f} cm and {angle:.0f} degrees, to the target"
         if relation["success"] is not None:
             rows["placement"] = _placement(relation)
+    if "camera" in record:
+        clusters, frame = record["camera"]["clusters"], record["camera"]["frame"]
+        taken = next(one for one in clusters if one["taken"] == "object")
+        rows["object"] = f"{taken['points']} points of the depth images, 1 of {len(clusters)} objects"
+        if frame == "camera":
+            rows["frame"] = "that of the camera, because there is no --camera-pose"
     if record["modes"] is not None:
         rows["solutions"] = _solutions(record["modes"])
     if record["recognised"] is not None:

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal, TypeVar, cast
 
 import numpy as np
 import tyro
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
@@ -25,8 +25,9 @@ from tdf_jax.shapes import FAMILIES
 
 Category = Literal["mug", "bowl", "bottle", "rack", "container"]
 MULTI = ("mug", "bowl", "bottle")  # categories that the shipped weights `multi` were trained on
-# Options that make or read another demonstration than that of a task.
-CONTRADICT_TASK = ("demonstration", "target_object", "category", "trajectory", "num_poses", "queries")
+DEPTH_OPTIONS = ("intrinsics", "camera_pose", "mask", "workspace", "depth_scale", "clusters")  # that need --depth
+# Options that make or read another object or demonstration than that of a task.
+CONTRADICT_TASK = ("depth", "demonstration", "target_object", "category", "trajectory", "num_poses", "queries")
 
 
 def _option(metavar: str | None = None, default: str | None = None):
@@ -85,6 +86,16 @@ class Settings(SceneSettings):
         target_pose: pose of the target in the world: that of its file, or a random rotation and translation of it. With
             --task, given is upright with a random yaw.
         task: place a generated object on a generated target, both from one seed, as demonstrated on another such pair.
+        depth: depth images of the new object instead of --target: 16-bit .png or .tif with --depth-scale, or .npy in
+            metres. Without --mask, the table is removed and the demonstration's object is chosen among the others.
+        intrinsics: focal lengths and principal point of the camera, pixels; or a file with them or with the matrix K
+            (.txt, .npy, .json), or one for each image.
+        camera_pose: file of the camera's pose T_world_camera for each image, 4x4, metres (.txt, .npy); x to the right
+            of the image, y down, z forward. Without it the camera's frame is the world.
+        mask: image of the object's pixels for each depth image; then nothing is removed but pixels at edges.
+        workspace: box that the objects are in, metres, world frame.
+        depth_scale: metres per unit of the depth images, such as 0.001 for millimetres.
+        clusters: say which objects the depth images show, and which was taken.
         goal_offset: translation that is added to the goal, metres, world frame.
         target_object: mesh or point cloud of the object that the new one is placed on or in, in the unit of --target;
             the demonstration file must have one too. Without it the demonstrated one has not moved.
@@ -101,6 +112,15 @@ class Settings(SceneSettings):
 
     target: Annotated[Path | None, _option("FILE|known|found", "a generated object; found with --task")] = None
     task: Annotated[Literal["bowl_on_mug", "mug_on_rack", "bottle_in_container"] | None, _option(default="none")] = None
+    depth: Annotated[tuple[Path, ...] | None, _option("FILE ...", "none")] = None
+    intrinsics: Annotated[tuple[str, ...] | None, _option("FX FY CX CY|FILE ...", "none")] = None
+    camera_pose: Annotated[tuple[Path, ...] | None, _option("FILE ...", "the identity")] = None
+    mask: Annotated[tuple[Path, ...] | None, _option("FILE ...", "none")] = None
+    workspace: Annotated[
+        tuple[float, float, float, float, float, float] | None, _option("XMIN YMIN ZMIN XMAX YMAX ZMAX", "everywhere")
+    ] = None
+    depth_scale: Annotated[float | None, _option("FLOAT", "1; whole numbers need it")] = None
+    clusters: bool = False
     goal_offset: Annotated[tuple[float, float, float], _option("X Y Z")] = (0.0, 0.0, 0.0)
     target_object: Annotated[Path | None, _option("FILE", "none")] = None
     target_weights: Annotated[str | None, _option("NAME|FILE", "those of --weights, or of the category")] = None
@@ -193,7 +213,8 @@ def resolved(settings: AnySettings) -> AnySettings:
         one = settings.rotation in ("pick", "identity")
         query = settings.query or ("lattice" if one else "given")
         settings = cast(AnySettings, dataclasses.replace(settings, query=query))
-    pose = settings.target_pose or (generated if settings.target is None else "given")
+    seen = isinstance(settings, Settings) and settings.depth is not None
+    pose = settings.target_pose or (generated if settings.target is None and not seen else "given")
     if settings.demonstration is None:
         return dataclasses.replace(
             settings,
@@ -278,6 +299,7 @@ def _check_numbers(settings: SceneSettings) -> None:
         if settings.target is None and given:
             raise InputError(f"{settings.COMMAND}: --{name} is for a --target file; give one, or drop --{name}")
     if isinstance(settings, Settings):
+        _check_depth(settings)
         if settings.k is not None and settings.method == "carry":
             raise InputError(
                 "tdf imitate: --k is a weight of eq. 3, which --method carry does not minimise; drop it, or add "
@@ -313,12 +335,28 @@ def _check_numbers(settings: SceneSettings) -> None:
         checks.count("tdf landscape", "--rotations", settings.rotations)
 
 
-def make_scene(settings: SceneSettings, key: PRNGKeyArray) -> Scene:
+def _check_depth(settings: Settings) -> None:
+    """Options of depth images that contradict others."""
+    if settings.depth is None:
+        for name in DEPTH_OPTIONS:
+            if getattr(settings, name) not in (None, False):
+                option = "--" + name.replace("_", "-")
+                raise InputError(f"tdf imitate: {option} is for --depth images; give some, or drop {option}")
+        return
+    if not settings.depth:
+        raise InputError("tdf imitate: --depth has no file; expected at least one depth image")
+    for name, given in (("target", settings.target), ("target-pose random", settings.target_pose == "random")):
+        if given:
+            raise InputError(f"tdf imitate: --{name} is for another object than that of --depth; drop one")
+
+
+def make_scene(settings: SceneSettings, key: PRNGKeyArray, seen: Float[np.ndarray, "points 3"] | None = None) -> Scene:
     """Read or generate both objects.
 
     Args:
         settings: settings from `resolved`.
         key: random key of the query points.
+        seen: cloud of the new object, (points, 3), metres, that depth images show; None for that of `settings`.
 
     Raises:
         InputError: a file that cannot be used, or a number that makes no trajectory.
@@ -328,7 +366,8 @@ def make_scene(settings: SceneSettings, key: PRNGKeyArray) -> Scene:
     def pair() -> Case:
         return generated_case(cast(str, settings.category), settings.seed, 0, points=settings.points)
 
-    demonstration, target = _read_demonstration(settings), _read_target(settings)
+    demonstration = _read_demonstration(settings)
+    target = _read_target(settings) if seen is None else (seen, None)
     demonstrated_mesh, places, fold, others = None, None, 1, ()
     T_world_target = np.eye(4) if settings.target_pose == "given" else random_pose(settings.seed, 0)
     if target is None:

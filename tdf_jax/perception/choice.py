@@ -3,7 +3,7 @@
 import dataclasses
 import warnings
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple, overload
 
 import jax
 import numpy as np
@@ -42,9 +42,28 @@ class Choice(NamedTuple):
     target_residuals: Float[np.ndarray, " clouds"]
 
 
-Cloud = Float[np.ndarray, "_ 3"]
-
-
+@overload
+def pick_object(
+    model: Model,
+    clouds: Sequence[Float[Array | np.ndarray, "_ 3"]],
+    demonstration: Demonstration | Sequence[Demonstration] | Reference | None = None,
+    *,
+    target_model: Model | None = None,
+    key: PRNGKeyArray | None = None,
+    config: CarryConfig = CarryConfig(),
+    return_choice: Literal[False] = False,
+) -> Any: ...
+@overload
+def pick_object(
+    model: Model,
+    clouds: Sequence[Float[Array | np.ndarray, "_ 3"]],
+    demonstration: Demonstration | Sequence[Demonstration] | Reference | None = None,
+    *,
+    target_model: Model | None = None,
+    key: PRNGKeyArray | None = None,
+    config: CarryConfig = CarryConfig(),
+    return_choice: Literal[True],
+) -> tuple[Any, Choice]: ...
 @host
 def pick_object(
     model: Model,
@@ -55,7 +74,7 @@ def pick_object(
     key: PRNGKeyArray | None = None,
     config: CarryConfig = CarryConfig(),
     return_choice: bool = False,
-) -> Cloud | tuple[Cloud, Cloud] | tuple[Cloud | tuple[Cloud, Cloud], Choice]:
+) -> Any:
     """Choose the object among the clouds of a scene, and the target if the demonstration has one.
 
     With a demonstration, the object is the cloud in which its pick has the smallest residual: descriptors at the place
