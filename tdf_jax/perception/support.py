@@ -9,13 +9,13 @@ from numpy.typing import ArrayLike
 from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import host
 from tdf_jax._internal.errors import InputError
-from tdf_jax.perception.voxels import canonical_order, voxels_of
+from tdf_jax.perception.voxels import canonical_order, distinct_rows, voxels_of
 
 PATCH, TESTED = 0.03, 0.01  # metres, edges of the cells that give hypotheses, and of those that are counted
 HYPOTHESES, COUNTED = 400, 20_000  # most of each
 PATCH_POINTS = 6  # fewest cells in and around a patch of a hypothesis
 START_BAND = 0.015  # metres: half of the thickness of the first band, more than the noise of most cameras
-REFINED = 5  # best hypotheses that are refined
+REFINED, RANKED = 5, 3000  # best hypotheses that are refined, and cells whose points decide among them
 ITERATIONS = 30
 WIDTH = 2.5  # half of a fitted band's thickness, standard deviations
 # Standard deviations of the plane's noise above which a point is no longer the plane's: 1 of 740 noisy points of the
@@ -62,7 +62,7 @@ class Support(NamedTuple):
         """
         heights = self.heights(points)
         below = np.flatnonzero((heights < 0) & (heights > -START_BAND))
-        index = np.unique(self.cells(points, PLACE), axis=0, return_inverse=True)[1].reshape(-1)
+        index = distinct_rows(self.cells(points, PLACE))[1]
         below = below[np.lexsort((heights[below], index[below]))]
         counts = np.bincount(index[below], minlength=index.max() + 1)
         starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
@@ -162,18 +162,19 @@ def find_support(
     if not len(hypotheses):
         return None
     scores = np.array([np.count_nonzero(np.abs(chosen @ plane[:3] + plane[3]) < START_BAND) for plane in hypotheses])
+    few = np.isin(tested.index, tested.spread(RANKED))
     best, area = None, 0
     for index in np.argsort(-scores, kind="stable")[:REFINED]:
-        plane, noise = _refined(exact, areas, hypotheses[index])
+        plane, noise = _refined(exact[few], areas[few], hypotheses[index])
         if noise > MOST_NOISE:
             continue
         band = max(LEAST_BAND, WIDTH * noise)
         covered = int(np.count_nonzero(np.abs(tested.means @ plane[:3] + plane[3]) < band))
         if covered > area:
-            best, area = (plane, noise), covered
+            best, area = plane, covered
     if best is None or area < max(LEAST_AREA, LEAST_SHARE * len(tested.means)):
         return None
-    plane, noise = best
+    plane, noise = _refined(exact, areas, best)
     one = Support(plane, noise)
     sign = _side(exact, one) if position is None else np.sign(position @ plane[:3] + plane[3])
     return Support(plane * (sign or 1.0), noise)
@@ -228,7 +229,7 @@ def _side(points: Float[np.ndarray, "points 3"], support: Support) -> float:
     """Sign of the side with more points over the plane; beside it there may be a floor."""
     heights, cells = support.heights(points), support.cells(points, PATCH)
     band = max(LEAST_BAND, HEIGHT * support.noise)
-    index = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+    index = distinct_rows(cells)[1]
     covered = np.bincount(index, np.abs(heights) <= band) > 0
     over = covered[index]
     above, below = (np.count_nonzero(over & (sign * heights > band)) for sign in (1, -1))

@@ -37,6 +37,29 @@ def canonical_order(points: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, " 
     return np.lexsort(points.T)
 
 
+def distinct_rows(
+    cells: Int[np.ndarray, "points columns"],
+) -> tuple[Int[np.ndarray, " distinct"], Int[np.ndarray, " points"], Int[np.ndarray, " distinct"]]:
+    """Find the distinct rows of whole numbers, as `np.unique` of an axis does, but several times faster.
+
+    Args:
+        cells: rows of numbers, (points, columns).
+
+    Returns:
+        Index of the first of each distinct row, in the order of the rows; the distinct row of every point; and the
+        number of points of each.
+    """
+    low, extent = cells.min(axis=0), np.ptp(cells, axis=0) + 1
+    if np.prod(extent.astype(float)) < 2**62:
+        keys = np.zeros(len(cells), np.int64)
+        for column, start, size in zip(cells.T, low, extent):
+            keys = keys * size + (column - start)
+        _, first, index, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
+    else:
+        _, first, index, counts = np.unique(cells, axis=0, return_index=True, return_inverse=True, return_counts=True)
+    return first, index.reshape(-1), counts
+
+
 def voxels_of(points: Float[np.ndarray, "points 3"], edge: float) -> Voxels:
     """Find the occupied cells of a grid.
 
@@ -44,9 +67,8 @@ def voxels_of(points: Float[np.ndarray, "points 3"], edge: float) -> Voxels:
         points: points, (points, 3), metres, in their canonical order.
         edge: edge of a cell, metres.
     """
-    cells, index, counts = np.unique(
-        np.floor(points / edge).astype(np.int64), axis=0, return_inverse=True, return_counts=True
-    )
-    index = index.reshape(-1)
+    every = np.floor(points / edge).astype(np.int64)
+    first, index, counts = distinct_rows(every)
+    cells = every[first]
     sums = np.stack([np.bincount(index, column, len(cells)) for column in points.T], axis=1)
     return Voxels(cells, index, sums / counts[:, None], counts)
