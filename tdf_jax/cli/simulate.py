@@ -22,6 +22,8 @@ def simulate(
     clouds: Literal["full", "views3", "views1"] = "full",
     method: Literal["tdf_jax", "uncentred", "truth", "rigid replay", "ICP", "even blending", "paper"] = "tdf_jax",
     light: bool = False,
+    meshes: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint=_NONE)] = None,
+    recursive: bool = False,
     object_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
     target_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
     robot: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: UR5e and 2F-85)")] = None,
@@ -34,7 +36,8 @@ def simulate(
 ) -> None:
     """Pick, carry and place unseen objects in physics, from one demonstration, and count what succeeds.
 
-    Prints success with intervals and causes of failure. A run that was interrupted, or that is repeated with more
+    Prints success with intervals and causes of failure, and draws the first failure of each cause in the folder
+    failures of --out, where pictures can be rendered. A run that was interrupted, or that is repeated with more
     episodes, runs only what is missing. Needs the extra "sim".
 
     Args:
@@ -54,6 +57,10 @@ def simulate(
             over all poses but the last; it is given our goal of the same episode. All but uncentred and the truth have
             their grasps centred.
         light: objects of 0.01 kg, as in NDF and R-NDF, instead of 0.10 to 0.40 kg by volume.
+        meshes: folder of real objects with a meshes.json, which the episodes have in turn instead of generated ones;
+            those of another category are left out. Demonstrations are on generated objects. See
+            docs/guide/evaluation.md.
+        recursive: use the meshes in subfolders of that folder too.
         object_weights: weights of the object.
         target_weights: weights of the target.
         robot: MJCF of another arm with a parallel gripper.
@@ -64,14 +71,18 @@ def simulate(
         json: file for all outcomes.
         out: folder that keeps the outcomes between runs.
     """
+    import dataclasses
+
     from tdf_jax._internal import checks
     from tdf_jax._internal.errors import InputError
+    from tdf_jax.cli.episodes import FAILURES, SHEET, draw_failures
     from tdf_jax.evaluation.records import write_record
     from tdf_jax.networks.checkpoint import load_model
-    from tdf_jax.sim.campaign import NETWORKS, Condition, Settings, check_condition, check_counts, film, run_campaign
+    from tdf_jax.sim import campaign
+    from tdf_jax.sim.campaign import Condition, Settings, check_condition, check_counts, check_settings, film
     from tdf_jax.sim.physics import LIGHT_MASS, extra
     from tdf_jax.sim.recording import ENDINGS, check_film
-    from tdf_jax.sim.report import record, summary
+    from tdf_jax.sim.report import not_drawn, record, summary
     from tdf_jax.sim.robot import load_robot
     from tdf_jax.sim.tasks import TASKS
     from tdf_jax.sim.viewer import check_display
@@ -93,34 +104,40 @@ def simulate(
         check_film(video)
     if view:
         check_display()
+    objects = campaign.GENERATED if meshes is None else campaign.MESHES
     condition = Condition(
-        task, target, pose, mode, clouds, demonstrations, method, LIGHT_MASS if light else 0.0
-    )  # fmt: skip
+        task, target, pose, mode, clouds, demonstrations, method, LIGHT_MASS if light else 0.0, objects
+    )
     check_condition(condition)
+    if recursive and meshes is None:
+        raise InputError("tdf simulate: --recursive is of --meshes; expected both, or neither")
     if target_weights is None:
         target_weights = _shipped(TASKS[task].target)
-    if target == "found" and target_weights is None and method in NETWORKS:
-        raise InputError(
-            f"tdf simulate: there are no shipped weights of a {TASKS[task].target}; expected --target known, or "
-            "--target-weights FILE of a network from tdf train"
-        )
+    settings = Settings(
+        condition, object_weights or TASKS[task].object, target_weights, seed, out, robot, site, meshes, recursive
+    )
+    check_settings(settings)
     load_robot(robot, site)
-    object_weights = object_weights or TASKS[task].object
-    for weights in (object_weights, target_weights):
+    for weights in (settings.object_weights, target_weights):
         if weights is not None:
             load_model(weights)
+    campaign.load_objects(settings)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"tdf simulate: cannot make the folder {out} ({error}); expected a writable place") from None
-    settings = Settings(condition, object_weights, target_weights, seed, out.resolve(), robot, site)
-    runs = list(run_campaign(settings, episodes, processes, view=view))
+    settings = dataclasses.replace(settings, folder=out.resolve(), meshes=None if meshes is None else meshes.resolve())
+    runs = list(campaign.run_campaign(settings, episodes, processes, view=view))
     print(summary(runs))
     if json is not None:
         write_record("tdf simulate", json, record(settings, runs))
+    if not any(one.outcome.drawn for one in runs):
+        raise InputError(f"tdf simulate: no episode could be drawn: {'; '.join(not_drawn(runs))}")
     if video is not None:
         film(settings, 0, video)
         print(video)
+    if draw_failures("tdf simulate", [(settings, runs)], out / FAILURES):
+        print(out / FAILURES / SHEET)
 
 
 def _shipped(category: str) -> str | None:

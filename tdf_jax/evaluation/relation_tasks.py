@@ -108,13 +108,14 @@ class Placement:
         return np.linalg.inv(self.T_world_target) @ motion @ self.T_world_object
 
 
-def draw_pair(task: str, seed: int, number: int) -> Pair:
+def draw_pair(task: str, seed: int, number: int, given: Shape | None = None) -> Pair:
     """Pair `number` of a seed: two objects of natural size that no training run has, and that fit.
 
     Args:
         task: one of `RELATIONS`.
         seed: seed of the pairs.
         number: number of the pair.
+        given: the object, if only the target is drawn.
 
     Raises:
         InputError: there is no such task, or no pair of the seed fits.
@@ -123,7 +124,7 @@ def draw_pair(task: str, seed: int, number: int) -> Pair:
     relation = RELATIONS[task]
     rng = np.random.default_rng([SEED_SPACE, seed, number, 3])
     for redrawn in range(MOST_DRAWS):
-        one = _natural(relation.object, rng)
+        one = _natural(relation.object, rng) if given is None else given
         if relation.target == "container":
             target: Shape = build_container(
                 sample_container(rng, width=float(one.mesh.extents[:2].max()), height=one.height)

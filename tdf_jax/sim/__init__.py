@@ -6,6 +6,7 @@ Modules:
     board: a board at a height, the shelf of the tasks
     bodies: rigid bodies of generated objects
     decomposition: convex parts of users' meshes, and the bodies that they make
+    scans: objects of users' annotated meshes
     workcell: the table, an arm or a floating gripper, the object and the target
     cameras: depth cameras around a cell, and clouds of what they see
     removal_study: what the removal of a table and of flying pixels costs
@@ -17,6 +18,7 @@ Modules:
     retiming: times of a path of the joints within limits of velocity and acceleration
     motion: motions of a robot along a trajectory, from home to home
     execution: a joint trajectory in physics
+    pads: flat pads, and the turn at which what they clamp lies flush with them
     grasps: grasps of generated objects that a demonstration shows
     grasping: whether a grasp holds an object that is lifted and turned
     centring: a grasp in the middle of what is between the fingers
@@ -29,5 +31,6 @@ Modules:
     published: published success rates, and which rows stand beside them
     comparison: rows of many campaigns beside published ones, as a page and a record
     recording: pictures and films of a cell
+    failures: pictures of failed episodes
     viewer: MuJoCo's own viewer on a cell while it runs
 """

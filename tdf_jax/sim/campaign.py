@@ -20,18 +20,21 @@ from tqdm import tqdm
 from tdf_jax._internal import checks, workers
 from tdf_jax._internal.cache import digest, kept
 from tdf_jax._internal.errors import InputError
-from tdf_jax.sim.episode import MODES, NOT_FOUND, Outcome
-from tdf_jax.sim.tasks import POSES, TASKS
+from tdf_jax.sim.episode import MODES, NOT_DRAWN, NOT_FOUND, Outcome
+from tdf_jax.sim.tasks import POSES, TASKS, Episode, NotDrawn
 
 if TYPE_CHECKING:
     from tdf_jax.energy.reference import Reference
+    from tdf_jax.geometry.demonstration import Demonstration
     from tdf_jax.sim.replay import Replay
     from tdf_jax.sim.robot import Robot
+    from tdf_jax.sim.scans import Scan
 
-FORMAT = 5  # format number; raise it when what an episode computes changes
+FORMAT = 6  # format number; raise it when what an episode computes changes
 DEMONSTRATIONS = 10  # episodes that demonstrate; with one demonstration, each is that of a tenth of the episodes
 FIRST_DEMONSTRATION = 1_000_000  # their numbers begin here, so that no episode shares their objects
 MOST_PROCESSES = 1024  # more are a mistake
+GENERATED, MESHES = OBJECTS = ("generated", "meshes")
 CLOUDS = ("full", "views3", "views1")
 TARGETS = ("known", "found")
 LIBRARY, UNCENTRED, TRUTH, REPLAY, ICP = "tdf_jax", "uncentred", "truth", "rigid replay", "ICP"
@@ -54,6 +57,7 @@ class Condition(NamedTuple):
         demonstrations: number of demonstrations, 1 or 10.
         method: one of `METHODS`.
         mass: mass of the object, kg; 0 for that by its volume.
+        objects: "generated", or "meshes" for those of users, with demonstrations on generated ones.
     """
 
     task: str
@@ -64,6 +68,7 @@ class Condition(NamedTuple):
     demonstrations: int = 1
     method: str = LIBRARY
     mass: float = 0.0
+    objects: str = GENERATED
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,11 +78,12 @@ class Run:
     Attributes:
         condition: what it was measured under.
         number: number of the episode.
-        outcome: what became of it.
+        outcome: what became of it; that it was not drawn, if no start is within reach.
         rejected, redrawn: starts and pairs drawn before it; see `tdf_jax.sim.tasks.Episode`.
         seconds: times of the imitation, and of planning and physics together, with what each compiled; they differ
             from run to run.
-        planning: time of the planning alone; NaN if it is not known, in an outcome that an earlier version kept.
+        planning: time of the planning alone; NaN if it is not known.
+        instance: name of the user's mesh; empty for a generated object, of which every episode has its own.
     """
 
     condition: Condition
@@ -87,6 +93,12 @@ class Run:
     redrawn: int
     seconds: tuple[float, float]
     planning: float = math.nan
+    instance: str = ""
+
+    @property
+    def object(self) -> str | int:
+        """What intervals are over: the mesh, or the number of the episode."""
+        return self.instance or self.number
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,6 +111,9 @@ class Settings:
         seed: seed of everything.
         folder: existing folder that keeps outcomes.
         robot, site: MJCF of another robot and the site of its gripper's frame; see `load_robot`.
+        meshes: folder of the objects with a meshes.json, for a condition of "meshes"; episode n has mesh n, modulo
+            their number. See `tdf_jax.evaluation.annotated_meshes`.
+        recursive: read the meshes in subfolders too.
     """
 
     condition: Condition
@@ -108,6 +123,8 @@ class Settings:
     folder: Path
     robot: Path | None = None
     site: str | None = None
+    meshes: Path | None = None
+    recursive: bool = False
 
 
 def check_condition(condition: Condition) -> None:
@@ -120,6 +137,7 @@ def check_condition(condition: Condition) -> None:
         ("mode", MODES),
         ("clouds", CLOUDS),
         ("method", METHODS),
+        ("objects", OBJECTS),
     ):
         checks.choice(function, name, getattr(condition, name), choices)
     if condition.demonstrations not in (1, DEMONSTRATIONS):
@@ -133,6 +151,22 @@ def check_condition(condition: Condition) -> None:
         )
     if condition.demonstrations > 1 and condition.method != LIBRARY:
         raise InputError(f"{function}: {condition.method} has one demonstration; expected --demonstrations 1")
+
+
+def check_settings(settings: Settings) -> None:
+    """Raise InputError unless the condition of a campaign can be measured with the rest of its settings."""
+    condition, function = settings.condition, "tdf simulate"
+    check_condition(condition)
+    if condition.target == "found" and settings.target_weights is None and condition.method in NETWORKS:
+        raise InputError(
+            f"{function}: there are no weights of a {TASKS[condition.task].target}, which is to be found; expected "
+            "--target known, or --target-weights FILE of a network from tdf train"
+        )
+    if (condition.objects == MESHES) != (settings.meshes is not None):
+        raise InputError(
+            f"{function}: objects is {condition.objects!r} and meshes is {settings.meshes}; expected a folder for "
+            f"{MESHES!r} alone"
+        )
 
 
 def check_counts(function: str, episodes: int, processes: int | None, dashes: str) -> None:
@@ -158,7 +192,7 @@ def run_campaign(
 
     Args:
         settings: what the episodes share.
-        episodes: number of episodes.
+        episodes: number of episodes. One of which no start is within reach is said to be not drawn.
         processes: number of processes; by default one for every core.
         progress: show a progress bar.
         view: show the first episode in MuJoCo's viewer while it runs, also if its outcome is kept; see `Viewer`.
@@ -167,10 +201,12 @@ def run_campaign(
         The episodes, in order.
 
     Raises:
-        InputError: the condition cannot be measured, or a number is out of range.
+        InputError: the condition cannot be measured, a number is out of range, or a mesh cannot be used.
     """
-    check_condition(settings.condition)
+    check_settings(settings)
     check_counts("run_campaign()", episodes, processes, "")
+    for scan in load_objects(settings)[:episodes]:
+        _ = scan.body  # split into convex parts once, and not in every process
     count = min(episodes, processes or len(os.sched_getaffinity(0)))
     bar = tqdm(
         total=episodes,
@@ -178,7 +214,7 @@ def run_campaign(
         unit="episode",
         disable=not progress,
     )
-    with _pool(count) as pool:
+    with process_pool(count) as pool:
         pending = [pool.submit(run_one, settings, number, view and number == 0) for number in range(episodes)]
         try:
             for one in pending:
@@ -190,8 +226,25 @@ def run_campaign(
             bar.close()
 
 
+def load_objects(settings: Settings) -> "list[Scan]":
+    """The users' meshes of the task's category, in the order of their names; none if objects are generated.
+
+    Args:
+        settings: what the episodes share.
+
+    Raises:
+        InputError: a mesh cannot be used, or there is none.
+    """
+    if settings.meshes is None:
+        return []
+    from tdf_jax.sim.scans import load_scans
+
+    category = TASKS[settings.condition.task].object
+    return load_scans("tdf simulate", settings.meshes, settings.recursive, category)
+
+
 @contextlib.contextmanager
-def _pool(count: int):
+def process_pool(count: int):
     """Processes in which a product of matrices uses one core: the order of its sums is the same in all."""
     flag, name = "--xla_cpu_multi_thread_eigen=false", "XLA_FLAGS"
     before = os.environ.get(name)
@@ -215,16 +268,45 @@ def run_one(settings: Settings, number: int, view: bool = False) -> Run:
         number: number of the episode.
         view: run it, and show it in MuJoCo's viewer. Its outcome is the same.
     """
-    condition = settings.condition
+    result = _kept(settings, number, view)
+    fields = {field.name: result[field.name].item() for field in dataclasses.fields(Outcome)}
+    imitation, executed, planning = map(float, result["seconds"])
+    drawn, instance = (int(result["rejected"]), int(result["redrawn"])), result["instance"].item()
+    return Run(settings.condition, number, Outcome(**fields), *drawn, (imitation, executed), planning, instance)
+
+
+def _kept(settings: Settings, number: int, view: bool = False) -> dict[str, np.ndarray]:
+    """The arrays of an episode: kept, or computed and kept."""
     bench = _bench(settings)
-    about = [FORMAT, version("tdf_jax"), *bench.fingerprints, *bench.robot_content, *condition, settings.seed, number]
+    scan = bench.scan(number)
+    about = [
+        *(FORMAT, version("tdf_jax"), *bench.fingerprints, *bench.robot_content, *settings.condition),
+        *(settings.seed, number, None if scan is None else [scan.name, scan.digest]),
+    ]
     # A viewed episode runs, also if its outcome is kept.
     viewed = bench.run(number, view=True) if view else None
-    result = kept("tdf simulate", settings.folder, about, lambda: bench.run(number) if viewed is None else viewed)
-    fields = {field.name: result[field.name].item() for field in dataclasses.fields(Outcome)}
-    imitation, executed, *planning = map(float, result["seconds"])
-    drawn = int(result["rejected"]), int(result["redrawn"])
-    return Run(condition, number, Outcome(**fields), *drawn, (imitation, executed), *planning)
+    return kept("tdf simulate", settings.folder, about, lambda: bench.run(number) if viewed is None else viewed)
+
+
+def found_in(settings: Settings, number: int) -> tuple[Episode, "Robot", Float[np.ndarray, "_ _ 4 4"], np.ndarray]:
+    """What an episode is, and what was imitated in it: kept, or computed and kept.
+
+    Args:
+        settings: what the episodes share.
+        number: number of the episode.
+
+    Returns:
+        The episode, the robot, trajectories of the gripper from the pick to the release, (paths, poses, 4, 4), metres,
+        world frame, the best first, and the motion M of the object, 4x4.
+
+    Raises:
+        InputError: nothing is drawn or imitated.
+    """
+    result = _kept(settings, number)
+    if not len(result["paths"]):
+        raise InputError(f"tdf simulate: episode {number} has no motion: {result['detail'].item()}")
+    bench = _bench(settings)
+    return bench.episode(number)[0], bench.robot, result["paths"], result["motion"]
 
 
 def film(settings: Settings, number: int, path: Path) -> Outcome:
@@ -242,7 +324,7 @@ def film(settings: Settings, number: int, path: Path) -> Outcome:
         InputError: nothing can be rendered here, the ending is another one, or the episode has no motion.
     """
     # In a process as those of the campaign: in this one, sums of products may have another order.
-    with _pool(1) as pool:
+    with process_pool(1) as pool:
         return pool.submit(film_one, settings, number, path).result()
 
 
@@ -251,13 +333,9 @@ def film_one(settings: Settings, number: int, path: Path) -> Outcome:
     from tdf_jax.sim.episode import run_episode
     from tdf_jax.sim.recording import Recorder
 
-    bench = _bench(settings)
-    episode, shown = bench.episode(number)
-    found = bench.found(episode, shown)
-    if isinstance(found, Outcome):
-        raise InputError(f"tdf simulate: episode {number} has no motion to film: {found.detail}")
+    episode, robot, paths, _ = found_in(settings, number)
     with _watched(Recorder) as (watch, recorders):
-        outcome = run_episode(episode, bench.robot, found[0], watch=watch)
+        outcome = run_episode(episode, robot, list(paths), watch=watch)
         if not recorders:
             raise InputError(f"tdf simulate: episode {number} has no motion to film: {outcome.detail}")
         recorders[0].save(path)
@@ -319,20 +397,35 @@ class _Bench:
         ]  # fmt: skip
         # Of the package's robot nothing: its version is pinned.
         self.robot_content = [] if settings.robot is None else [digest(settings.robot.read_bytes()), settings.site]
-        self._shown: dict[int, tuple] = {}
+        self.scans = load_objects(settings)
+        self._shown: dict[int, tuple[Episode, Demonstration] | NotDrawn] = {}
         self._described: dict[int, Reference] = {}
         self._paper: dict[int, Reference] = {}
 
-    def shown(self, number: int):
-        """The demonstrated episode and the demonstration."""
+    def scan(self, number: int) -> "Scan | None":
+        """The user's mesh that an episode has; None if its object is generated."""
+        return self.scans[number % len(self.scans)] if self.scans else None
+
+    def shown(self, number: int) -> "tuple[Episode, Demonstration]":
+        """The demonstrated episode and the demonstration.
+
+        Raises:
+            NotDrawn: nothing within reach is drawn.
+        """
         from tdf_jax.sim.tasks import demonstrate_episode, draw_episode
 
         if number not in self._shown:
-            episode = draw_episode(
-                self.condition.task, self.robot, self.settings.seed, FIRST_DEMONSTRATION + number, "upright"
-            )
-            self._shown[number] = episode, demonstrate_episode(episode, self.settings.seed)
-        return self._shown[number]
+            try:
+                episode = draw_episode(
+                    self.condition.task, self.robot, self.settings.seed, FIRST_DEMONSTRATION + number, "upright"
+                )
+                self._shown[number] = episode, demonstrate_episode(episode, self.settings.seed)
+            except NotDrawn as error:  # so that it is not tried again for every episode
+                self._shown[number] = error
+        found = self._shown[number]
+        if isinstance(found, NotDrawn):
+            raise NotDrawn(f"{found} (of the demonstrations)")
+        return found
 
     def reference(self, number: int) -> "Reference":
         """The descriptors of a demonstration, or of all."""
@@ -359,7 +452,7 @@ class _Bench:
         condition, seed = self.condition, self.settings.seed
         shown = -1 if condition.demonstrations > 1 else number % DEMONSTRATIONS
         known = self.shown(shown)[0] if condition.target == "known" else None
-        episode = draw_episode(condition.task, self.robot, seed, number, condition.poses, known)
+        episode = draw_episode(condition.task, self.robot, seed, number, condition.poses, known, self.scan(number))
         if condition.mass:
             body = dataclasses.replace(
                 episode.object_body,
@@ -374,10 +467,18 @@ class _Bench:
         from tdf_jax.sim.episode import run_episode, teleport
         from tdf_jax.sim.viewer import Viewer
 
-        condition = self.condition
-        episode, shown = self.episode(number)
-        began = time.perf_counter()
-        found = self.found(episode, shown)
+        condition, scan = self.condition, self.scan(number)
+        instance = "" if scan is None else scan.name
+        try:
+            episode, shown = self.episode(number)
+            began = time.perf_counter()
+            found = self.found(episode, shown)
+        except NotDrawn as error:
+            return {
+                **dataclasses.asdict(Outcome.failure(NOT_DRAWN, str(error))),
+                **{"rejected": error.rejected, "redrawn": error.redrawn, "seconds": (0.0, 0.0, 0.0)},
+                **{"instance": instance, "paths": np.zeros((0, 0, 4, 4)), "motion": np.eye(4)},
+            }
         imitated = planned = time.perf_counter()
 
         def plan_ends():
@@ -397,6 +498,9 @@ class _Bench:
             "rejected": episode.rejected,
             "redrawn": episode.redrawn,
             "seconds": seconds,
+            "instance": instance,
+            "paths": np.zeros((0, 0, 4, 4)) if isinstance(found, Outcome) else np.array(found[0]),
+            "motion": np.eye(4) if isinstance(found, Outcome) else found[1],
         }
 
     def found(self, episode, shown: int) -> tuple[Sequence[np.ndarray], np.ndarray] | Outcome:
@@ -405,6 +509,8 @@ class _Bench:
             self.reference(shown)  # what is wrong with the weights is no failure of an episode, and ends the campaign
         try:
             return self.imitated(episode, shown)
+        except NotDrawn:  # of the demonstrations
+            raise
         except InputError as error:
             return Outcome.failure(NOT_FOUND, str(error))
 

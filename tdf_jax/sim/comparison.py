@@ -14,7 +14,8 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.statistics import bootstrap_interval
 from tdf_jax.evaluation.tables import between, markdown, percent
 from tdf_jax.sim import report
-from tdf_jax.sim.campaign import DEMONSTRATIONS, LIBRARY, TRUTH, Condition, Run, Settings
+from tdf_jax.sim.campaign import DEMONSTRATIONS, GENERATED, LIBRARY, MESHES, TRUTH, Condition, Run, Settings
+from tdf_jax.sim.episode import CRITERIA
 from tdf_jax.sim.physics import LIGHT_MASS
 from tdf_jax.sim.published import PAPERS, Published, peers_of
 from tdf_jax.sim.tasks import TASKS
@@ -48,8 +49,9 @@ class Row:
 
     Attributes:
         settings: what its episodes share.
-        runs: the episodes.
+        runs: the episodes that were drawn.
         condition: what they are measured under.
+        not_drawn: what could not be drawn, and why, in words.
     """
 
     def __init__(self, settings: Settings, runs: Sequence[Run]):
@@ -59,26 +61,33 @@ class Row:
             settings: what the episodes share.
             runs: the episodes, at least one.
         """
-        self.settings, self.runs, self.condition = settings, list(runs), settings.condition
+        self.settings, self.condition = settings, settings.condition
+        self.all, self.runs = list(runs), [one for one in runs if one.outcome.drawn]
+        self.not_drawn = report.not_drawn(runs)
         self.rates = report.rates(self.runs)
         self.causes = report.causes(self.runs)
 
-    def values(self, rate: str) -> dict[tuple[str, int], float]:
-        """What each episode has in a rate, 0 or 1, by the object: the task and the number of the episode."""
-        return {(self.condition.task, one.number): float(getattr(one.outcome, rate)) for one in self.runs}
+    def values(self, rate: str) -> dict[int, tuple[float, tuple[str, str | int]]]:
+        """What each episode has in a rate, 0 or 1, and its object, by the number of the episode."""
+        task = self.condition.task
+        return {one.number: (float(getattr(one.outcome, rate)), (task, one.object)) for one in self.runs}
 
     def likely(self, rate: str) -> tuple[float, float]:
         """Interval of a rate; where all episodes are alike the bootstrap has no width, and the rule of three counts."""
         share, interval = self.rates[rate]
+        if share is None:
+            return 0.0, 1.0
         low, high = interval or (share, share)
         if low == high:
-            reach = 3 / len(self.runs)  # of n successes, a rate below 1 - 3 / n is unlikely (5 %)
+            reach = 3 / len(
+                {one.object for one in self.runs}
+            )  # of n successes, a rate below 1 - 3 / n is unlikely (5 %)
             low, high = max(low - reach, 0.0), min(high + reach, 1.0)
         return low, high
 
     def moved(self) -> tuple[float, float] | None:
         """Median movement in the hand after closing, metres and degrees; None if nothing was held."""
-        moved = np.array([(one.outcome.slip, one.outcome.turn) for one in self.runs], float)
+        moved = np.array([(one.outcome.slip, one.outcome.turn) for one in self.runs], float).reshape(-1, 2)
         moved = moved[np.isfinite(moved).all(axis=1)]
         if not len(moved):
             return None
@@ -87,7 +96,7 @@ class Row:
 
     def drawn(self) -> tuple[int, int]:
         """Numbers of starts out of reach and of pairs that do not fit, drawn before the episodes."""
-        return sum(one.rejected for one in self.runs), sum(one.redrawn for one in self.runs)
+        return sum(one.rejected for one in self.all), sum(one.redrawn for one in self.all)
 
     def seconds(self) -> Float[np.ndarray, "episodes 3"]:
         """Wall times of `tdf_jax.sim.report.PARTS`, (episodes, 3), seconds; NaN where one is not known."""
@@ -103,6 +112,7 @@ def planned_rows(
     methods: Sequence[str],
     demonstrations: Sequence[int],
     light: bool,
+    objects: Sequence[str] = (GENERATED,),
 ) -> list[Condition]:
     """All combinations that can be measured.
 
@@ -117,6 +127,7 @@ def planned_rows(
         methods: names of `tdf_jax.sim.campaign.METHODS`.
         demonstrations: numbers of demonstrations, 1 and 10.
         light: whether teleported objects have the mass of those in NDF and R-NDF; executed ones never do.
+        objects: names of `tdf_jax.sim.campaign.OBJECTS`.
 
     Raises:
         InputError: an argument is empty, or one of its values is in no combination.
@@ -134,9 +145,12 @@ def planned_rows(
     for count in demonstrations:
         checks.choice(function, "--demonstrations", count, (1, DEMONSTRATIONS))
     rows = [
-        Condition(task, target, start, mode, cloud, count, method, LIGHT_MASS if light and mode == "teleport" else 0.0)
+        Condition(
+            task, target, start, mode, cloud, count, method, LIGHT_MASS if light and mode == "teleport" else 0.0, kind
+        )
         for task in dict.fromkeys(tasks)
         for mode in dict.fromkeys(modes)
+        for kind in dict.fromkeys(objects)
         for target in dict.fromkeys(targets or TARGETS[task])
         for cloud in dict.fromkeys(clouds)
         for start in dict.fromkeys(poses)
@@ -169,7 +183,7 @@ def record(rows: Sequence[Row], settings: Mapping[str, Any]) -> dict[str, Any]:
     """
     made, seconds = [], []
     for row in rows:
-        one = report.record(row.settings, row.runs)
+        one = report.record(row.settings, row.all)
         seconds.append(one.pop("seconds"))
         for name in ("schema", "tdf_jax", "seed"):  # of the whole record
             one.pop(name)
@@ -195,12 +209,13 @@ def machine() -> dict[str, Any]:
     return {"cores": os.cpu_count(), **versions}
 
 
-def page(rows: Sequence[Row], settings: Mapping[str, Any]) -> str:
+def page(rows: Sequence[Row], settings: Mapping[str, Any], sheet: str | None = None) -> str:
     """Render the page.
 
     Args:
         rows: all campaigns.
         settings: settings of the command.
+        sheet: path of a picture of failures from the page; None if there is none.
     """
     parts = ["# Simulation", _setup(rows, settings), "## Reading", *reading(rows)]
     for task in dict.fromkeys(row.condition.task for row in rows):
@@ -209,7 +224,10 @@ def page(rows: Sequence[Row], settings: Mapping[str, Any]) -> str:
             mine = [row for row in rows if row.condition.task == task and row.condition.mode == mode]
             if mine:
                 parts += [f"### {title}: {_words(task)}", _rates(mine)]
-    parts += ["## Failures and draws", _failures(rows), "## Times", _times(rows, settings)]
+    parts += ["## Criteria of the place", _criteria(rows), "## Failures and draws", _failures(rows)]
+    if sheet is not None:
+        parts.append(f"![The first failed episode of each cause]({sheet})")
+    parts += ["## Times", _times(rows, settings)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -248,6 +266,7 @@ def reading(rows: Sequence[Row]) -> list[str]:
             listed = ", ".join(f"{cause} {count}" for cause, count in most)
             total = sum(len(row.runs) for row in mine)
             lines.append(f"- Causes of failure in {total} {words} episodes of the library: {listed}.")
+    lines += [f"- Not drawn, and not counted: {words}." for row in rows for words in row.not_drawn]
     few = min(len(row.runs) for row in rows)
     if few < FEW:
         lines.append(f"- Rows of {few} episodes show that the command works, and little else.")
@@ -265,6 +284,8 @@ def _against_published(ours: Sequence[Row]) -> list[str]:
     for system in PAPERS:
         counts = {"below": 0, "in": 0, "above": 0}
         for row in ours:
+            if row.condition.objects != GENERATED or not row.runs:
+                continue
             name = "place" if system == "R-NDF" else "overall"
             peers = [one for one in peers_of(row.condition) if one.system == system]
             theirs = getattr(max(peers, key=lambda one: one.demonstrations), name) if peers else None
@@ -292,7 +313,10 @@ def _pairs(rows: Sequence[Row], field: str, before: Any, after: Any) -> list[tup
         return tuple(other.items())
 
     first = {key(row): row for row in rows if getattr(row.condition, field) == before}
-    return [(first[key(row)], row) for row in rows if getattr(row.condition, field) == after and key(row) in first]
+    pairs = [(first[key(row)], row) for row in rows if getattr(row.condition, field) == after and key(row) in first]
+    return [
+        (one, other) for one, other in pairs if {run.number for run in one.runs} & {run.number for run in other.runs}
+    ]
 
 
 def _difference(pairs: Sequence[tuple[Row, Row]], same: bool = True) -> str:
@@ -305,10 +329,10 @@ def _difference(pairs: Sequence[tuple[Row, Row]], same: bool = True) -> str:
     changes, objects = [], []
     for before, after in pairs:
         first, second = before.values("overall"), after.values("overall")
-        for key in first:
-            if key in second:
-                changes.append(second[key] - first[key])
-                objects.append(key)
+        for number, (value, one) in first.items():
+            if number in second:
+                changes.append(second[number][0] - value)
+                objects.append(one)
     mean, interval = float(np.mean(changes)), bootstrap_interval(np.array(changes), objects)
     points = f"{abs(100 * mean):.0f}"
     words = (
@@ -320,7 +344,11 @@ def _difference(pairs: Sequence[tuple[Row, Row]], same: bool = True) -> str:
 
 
 def _setup(rows: Sequence[Row], settings: Mapping[str, Any]) -> str:
-    episodes = sorted({len(row.runs) for row in rows})
+    episodes = sorted({len(row.runs) for row in rows if row.condition.objects == GENERATED})
+    meshes = [row for row in rows if row.condition.objects == MESHES]
+    names = sorted({one.instance for row in meshes for one in row.all})
+    unseen = f"{' or '.join(map(str, episodes))} episodes a row, each with an unseen generated object" * bool(episodes)
+    real = f"rows of meshes have episodes of {', '.join(names)} in turn, their intervals over meshes" * bool(names)
     light = any(row.condition.mass for row in rows)
     masses = (
         f"Teleported objects weigh {LIGHT_MASS:g} kg, as the published ones; executed ones have masses by their volume."
@@ -332,7 +360,7 @@ def _setup(rows: Sequence[Row], settings: Mapping[str, Any]) -> str:
         "NDF and R-NDF. [The guide](../guide/simulation.md) says what is simulated and what a success is, and "
         "[development measurements](simulation_notes.md) what was tried on the way.\n\n"
         f"`{_command(settings)}` made this page and [the record of every episode](simulation/simulation.json): "
-        f"{' or '.join(map(str, episodes))} episodes a row, each with an unseen generated object. {masses} "
+        f"{'; '.join(one for one in (unseen, real) if one)}. {masses} "
         "Intervals in brackets are 95 % bootstrap intervals over objects; where all episodes of a row are alike they "
         "have no width, and a rate that differs by less than 3 over the number of episodes remains likely. Starts were "
         "drawn before any method ran, and those out of reach were rejected.\n\n"
@@ -351,6 +379,8 @@ def _command(settings: Mapping[str, Any]) -> str:
     words = ["tdf", "benchmark", "--simulation"]
     for name, value in settings.items():
         flag = "--" + name.replace("_", "-")
+        if name == "num_poses" and settings.get("meshes") is None:
+            continue
         if value is True:
             words.append(flag)
         elif isinstance(value, tuple | list):
@@ -363,7 +393,8 @@ def _command(settings: Mapping[str, Any]) -> str:
 def _conditions(row: Row) -> list[str]:
     condition = row.condition
     method = "**tdf_jax**" if condition.method == LIBRARY else condition.method
-    return [condition.target, condition.poses, condition.clouds, str(condition.demonstrations), method]
+    poses = condition.poses + ", meshes" * (condition.objects == MESHES)
+    return [condition.target, poses, condition.clouds, str(condition.demonstrations), method]
 
 
 def _rates(rows: Sequence[Row]) -> str:
@@ -403,6 +434,20 @@ def _peer(rows: Sequence[Published]) -> str:
     return " ".join(cells)
 
 
+def _criteria(rows: Sequence[Row]) -> str:
+    cells = []
+    for row in rows:
+        found = report.criteria(row.all)
+        shares = [percent(found[name][0]) + between(found[name][1]) if name in found else "" for name in CRITERIA]
+        cells.append([_words(row.condition.task), row.condition.mode, *_conditions(row), *shares])
+    heads = ["task", "mode", *CONDITIONS, *(report.WORDS[name] for name in CRITERIA)]
+    return (
+        "How often each criterion of the place holds by itself, whatever the others say; an episode in which nothing "
+        "moved fulfils none. An empty cell is a criterion that the mode or the object does not have.\n\n"
+        + markdown(heads, cells)
+    )
+
+
 def _failures(rows: Sequence[Row]) -> str:
     cells = []
     for row in rows:
@@ -439,7 +484,7 @@ def _times(rows: Sequence[Row], settings: Mapping[str, Any]) -> str:
                 _words(row.condition.task),
                 row.condition.mode,
                 *_conditions(row),
-                *map(_number, np.median(seconds, axis=0)),
+                *(_number(float(np.median(part)) if len(part) else np.nan) for part in seconds.T),
                 _number(total / 60),
             ]
         )

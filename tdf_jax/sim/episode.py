@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -29,8 +29,10 @@ LOST = 0.1  # seconds without contact after which the object is not in the hand 
 WATCHED = 5  # steps of the physics between looks
 # Errors of a pick, metres and degrees, from which it is the pick that failed.
 WRONG_PICK = (0.03, 30.0)
+NOT_DRAWN = "not drawn"  # no start is within reach: there is no episode
 NOT_FOUND = "not found"  # there is no pick or no goal to execute
 CAUSES = (
+    NOT_DRAWN,
     NOT_FOUND,
     "pick wrong",
     "unreachable",
@@ -44,6 +46,24 @@ CAUSES = (
     "not on the peg",
     "not settled",
 )
+# What a placement must be, each a field of `Outcome`.
+CRITERIA = ("touches", "off_table", "settled", "upright", "comes_off", "hung", "no_collision")
+
+
+class Verdict(NamedTuple):
+    """Whether an object is placed.
+
+    Attributes:
+        placed: whether it is, whatever a mug hangs by.
+        cause: what is wrong, of `CAUSES`; empty if it is placed, and a mug hangs by its handle.
+        detail: more about it, in words.
+        criteria: whether each of `CRITERIA` holds.
+    """
+
+    placed: bool
+    cause: str
+    detail: str
+    criteria: dict[str, bool]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +78,14 @@ class Outcome:
         cause: the first thing that went wrong, of `CAUSES`; empty for a success.
         detail: more about it, in words.
         slip, turn: movement of the object in the hand after closing, metres and degrees; NaN without a grasp.
+        touches: whether the object touched the target in the end. This and all that follow are False where nothing
+            moved.
+        off_table: whether it did not touch the table.
+        settled: whether it was slower than `MOVING`.
+        upright: whether it was within 15 degrees of upright.
+        comes_off: whether it came off the target with gravity reversed; False in "execute", which does not test it.
+        hung: whether a peg went through a mug's finger hole; True of other objects.
+        no_collision: whether the arm touched nothing; True in "teleport", which has no arm.
     """
 
     grasp: bool
@@ -68,6 +96,18 @@ class Outcome:
     detail: str
     slip: float
     turn: float
+    touches: bool = False
+    off_table: bool = False
+    settled: bool = False
+    upright: bool = False
+    comes_off: bool = False
+    hung: bool = False
+    no_collision: bool = False
+
+    @property
+    def drawn(self) -> bool:
+        """Whether there was an episode."""
+        return self.cause != NOT_DRAWN
 
     @classmethod
     def failure(cls, cause: str, detail: str) -> "Outcome":
@@ -109,14 +149,15 @@ def teleport(
         rotation=release[:3, :3],
         fixture=episode.fixture,
     )
-    placed, hung, cause, detail = _reset(episode, motion @ episode.T_world_object)
+    placed, cause, detail, criteria = _reset(episode, motion @ episode.T_world_object)
     if not grasp.held:
         wrong = _pick_error(episode, pick)
         cause = "pick wrong" if wrong else "slipped"
         detail = wrong or f"{1e3 * grasp.slip:.0f} mm and {grasp.turn:.0f} degrees in the hand"
     overall = grasp.held and placed
+    strict = overall and criteria["hung"]
     return Outcome(
-        grasp.held, placed, overall, overall and hung, "" if overall and hung else cause, detail, grasp.slip, grasp.turn
+        grasp.held, placed, overall, strict, "" if strict else cause, detail, grasp.slip, grasp.turn, **criteria
     )
 
 
@@ -127,6 +168,7 @@ def run_episode(
     seed: int = 1,
     watch=None,
     planned: Callable[[], None] | None = None,
+    noted: Callable[[Workcell, Any, str], None] | None = None,
 ) -> Outcome:
     """Execute the first trajectory that can be planned, from home to home, and look where the object ended.
 
@@ -137,6 +179,8 @@ def run_episode(
         seed: seed of the planner.
         watch: called every few steps with the cell, the state and the phase, such as `Recorder`.
         planned: called when there is a plan, or none: the physics begins.
+        noted: called with the cell, the state and a word when something happens: "closed", "collided", "struck" (the
+            hand and the target), "lost" (from the hand), and "end".
     """
     cell = build_workcell(
         robot,
@@ -154,15 +198,17 @@ def run_episode(
     if isinstance(plan, Failure):
         return Outcome.failure("pick wrong" if wrong else "unreachable", wrong or plan.reason)
     data = cell.data()
-    observer = _Observer(cell, watch)
+    observer = _Observer(cell, watch, noted)
     execute(cell, data, plan.motion, observer)
-    _settle(cell, data)
-    placed, hung, cause, detail = _judged(episode, cell, data)
+    settle(cell, data)
+    observer.note(data, "end")
+    placed, cause, detail, criteria = _judged(episode, cell, data)
+    criteria["no_collision"] = not observer.collided
     slip, turn = observer.moved_in_hand()
     held = observer.held
     if observer.collided:
         placed, cause, detail = False, "collided", observer.collided
-    elif not placed or not hung:
+    elif cause or not observer.held:
         if not observer.held:
             cause, detail = (
                 ("pick wrong", _pick_error(episode, plan.pick))
@@ -174,14 +220,15 @@ def run_episode(
         elif observer.struck:
             cause, detail = "hit the target on approach", f"{observer.struck}; {detail}"
     overall = held and placed
-    return Outcome(held, placed, overall, overall and hung, "" if overall and hung else cause, detail, slip, turn)
+    strict = overall and criteria["hung"]
+    return Outcome(held, placed, overall, strict, "" if strict else cause, detail, slip, turn, **criteria)
 
 
 class _Observer:
     """Watches an episode: what the arm touches, and whether the object stays in the hand."""
 
-    def __init__(self, cell: Workcell, watch):
-        self.cell, self.watch = cell, watch
+    def __init__(self, cell: Workcell, watch, noted=None):
+        self.cell, self.watch, self.noted = cell, watch, noted
         self.kinds = geom_kinds(cell)
         self.collided, self.struck, self.lost, self.held = "", "", "", True
         self.without = 0
@@ -194,6 +241,7 @@ class _Observer:
             if any(model.equality(number).name == FIXTURE for number in range(model.neq)):
                 data.eq_active[model.equality(FIXTURE).id] = 0
             self.closed = self._in_hand(data)
+            self.note(data, "closed")
         if step % WATCHED:
             return
         pairs = {tuple(pair) for pair in np.sort(self.kinds[data.contact.geom[: data.ncon]], axis=1).tolist()}
@@ -206,15 +254,23 @@ class _Observer:
             ):
                 if (a, b) in pairs or (b, a) in pairs:
                     self.collided = f"{words} ({phase})"
+                    self.note(data, "collided")
         if not self.struck and phase in ("path", "approach") and (HAND_KIND, TARGET_KIND) in pairs:
             self.struck = f"the gripper touches the target ({phase})"
+            self.note(data, "struck")
         if phase == "path":
             self.last = self._in_hand(data)
             self.without = 0 if (HAND_KIND, OBJECT_KIND) in pairs else self.without + 1
             if self.held and self.without * WATCHED * TIMESTEP > LOST:
                 self.held, self.lost = False, f"out of the hand after {data.time:.1f} s"
+                self.note(data, "lost")
         if self.watch is not None:
             self.watch(self.cell, data, phase)
+
+    def note(self, data, word: str) -> None:
+        """Say that something happens."""
+        if self.noted is not None:
+            self.noted(self.cell, data, word)
 
     def moved_in_hand(self) -> tuple[float, float]:
         """Movement of the object in the hand from closing to the release, metres and degrees."""
@@ -231,10 +287,29 @@ class _Observer:
         return np.linalg.inv(self.cell.gripper_pose(data)) @ self.cell.body_pose(data, OBJECT)
 
 
-def _reset(episode: Episode, T_world_object) -> tuple[bool, bool, str, str]:
+def _reset(episode: Episode, T_world_object) -> Verdict:
     """Reset the object, let 2 s pass, and judge."""
-    mujoco = extra("teleport()", "mujoco")
-    cell = build_workcell(
+    cell = reset_cell(episode, T_world_object)
+    data = cell.data()
+    settle(cell, data)
+    verdict = _judged(episode, cell, data)
+    comes_off = _comes_off(episode, cell.body_pose(data, OBJECT), cell.body_pose(data, TARGET))
+    verdict.criteria["comes_off"] = comes_off
+    if verdict.placed and not comes_off:
+        return verdict._replace(
+            placed=False, cause="stuck", detail="with gravity reversed the object stays on the target"
+        )
+    return verdict
+
+
+def reset_cell(episode: Episode, T_world_object: Float[np.ndarray, "4 4"]) -> Workcell:
+    """The cell of an episode without a robot, the object reset to a pose.
+
+    Args:
+        episode: the episode.
+        T_world_object: pose of the object, 4x4, metres, world frame.
+    """
+    return build_workcell(
         None,
         episode.object_body,
         T_world_object,
@@ -242,49 +317,62 @@ def _reset(episode: Episode, T_world_object) -> tuple[bool, bool, str, str]:
         episode.T_world_target,
         fixed_target=TASKS[episode.task].fixed,
     )
-    data = cell.data()
-    _settle(cell, data)
-    verdict = _judged(episode, cell, data)
-    if not verdict[0]:
-        return verdict
-    # The target stays where it is, and there is no table.
-    T_object, T_target = cell.body_pose(data, OBJECT), cell.body_pose(data, TARGET)
+
+
+def _comes_off(episode: Episode, T_object, T_target) -> bool:
+    """Whether an object comes off with gravity reversed, where the target stays and there is no table."""
+    mujoco = extra("teleport()", "mujoco")
     turned = build_workcell(None, episode.object_body, T_object, episode.target_body, T_target, table=False)
     turned.model.opt.gravity[2] *= -1
     data = turned.data()
     for _ in range(int(UPSIDE_DOWN / TIMESTEP)):
         mujoco.mj_step(turned.model, data)
-    if np.linalg.norm(turned.body_pose(data, OBJECT)[:3, 3] - T_object[:3, 3]) < FALLS:
-        return False, verdict[1], "stuck", "with gravity reversed the object stays on the target"
-    return verdict
+    return bool(np.linalg.norm(turned.body_pose(data, OBJECT)[:3, 3] - T_object[:3, 3]) >= FALLS)
 
 
-def _settle(cell: Workcell, data: Any) -> None:
-    """Let 2 s pass."""
+def settle(cell: Workcell, data: Any) -> None:
+    """Let 2 s pass.
+
+    Args:
+        cell: the cell.
+        data: its state, which changes.
+    """
     mujoco = extra("run_episode()", "mujoco")
     for _ in range(int(SETTLE / TIMESTEP)):
         mujoco.mj_step(cell.model, data)
 
 
-def _judged(episode: Episode, cell: Workcell, data: Any) -> tuple[bool, bool, str, str]:
-    """Whether the object is placed, whether a mug hangs from its handle, and what is wrong."""
+def _judged(episode: Episode, cell: Workcell, data: Any) -> Verdict:
+    """Whether the object is placed, by each criterion that a state shows."""
     kinds = geom_kinds(cell)
     pairs = {tuple(pair) for pair in np.sort(kinds[data.contact.geom[: data.ncon]], axis=1).tolist()}
     T_target_object = np.linalg.inv(cell.body_pose(data, TARGET)) @ cell.body_pose(data, OBJECT)
+    is_mug = episode.object.category == "mug"
     hung = True
-    if episode.object.category == "mug":
+    if is_mug:
         mug, rack = cast(Mug, episode.object), cast(Rack, episode.target)
         hung = any(hole_is_crossed(mug, line, T_target_object) for line in rack.peg_lines)
-    if (OBJECT_KIND, TARGET_KIND) not in pairs:
-        return False, hung, "fell", "the object does not touch the target"
-    if (OBJECT_KIND, TABLE_KIND) in pairs:
-        return False, hung, "fell", "the object touches the table"
-    if np.linalg.norm(data.joint(OBJECT).qvel[:3]) > MOVING:
-        return False, hung, "not settled", f"the object still moves after {SETTLE:g} s"
     tilt = float(np.degrees(np.arccos(np.clip(cell.body_pose(data, OBJECT)[2, 2], -1, 1))))
-    if episode.object.category != "mug" and tilt > UPRIGHT:
-        return False, hung, "not upright", f"{tilt:.0f} degrees from upright"
-    return True, hung, "" if hung else "not on the peg", "" if hung else "no peg goes through the finger hole"
+    criteria = {
+        "touches": (OBJECT_KIND, TARGET_KIND) in pairs,
+        "off_table": (OBJECT_KIND, TABLE_KIND) not in pairs,
+        "settled": bool(np.linalg.norm(data.joint(OBJECT).qvel[:3]) <= MOVING),
+        "upright": tilt <= UPRIGHT,
+        "comes_off": False,
+        "hung": hung,
+        "no_collision": True,
+    }
+    for name, cause, detail in (
+        ("touches", "fell", "the object does not touch the target"),
+        ("off_table", "fell", "the object touches the table"),
+        ("settled", "not settled", f"the object still moves after {SETTLE:g} s"),
+        ("upright", "not upright", f"{tilt:.0f} degrees from upright"),
+    ):
+        if not criteria[name] and not (name == "upright" and is_mug):
+            return Verdict(False, cause, detail, criteria)
+    if not hung:
+        return Verdict(True, "not on the peg", "no peg goes through the finger hole", criteria)
+    return Verdict(True, "", "", criteria)
 
 
 def _pick_error(episode: Episode, pick) -> str:

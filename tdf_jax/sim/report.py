@@ -2,6 +2,7 @@
 
 import collections
 import dataclasses
+import re
 from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
@@ -10,25 +11,66 @@ import numpy as np
 from jaxtyping import Float
 
 from tdf_jax.evaluation.statistics import bootstrap_interval
-from tdf_jax.sim.campaign import Run, Settings
+from tdf_jax.evaluation.tables import percent
+from tdf_jax.sim.campaign import Condition, Run, Settings
+from tdf_jax.sim.episode import CRITERIA
+from tdf_jax.sim.tasks import TASKS
 
 PARTS = ("imitation", "planning", "physics")  # of an episode's wall time
 RATES = ("grasp", "place", "overall", "strict")
+WORDS = {  # of the criteria of a place
+    "touches": "touches the target",
+    "off_table": "not the table",
+    "settled": "settled",
+    "upright": "upright",
+    "comes_off": "comes off upside down",
+    "hung": "hung by the handle",
+    "no_collision": "no collision",
+}
 SCHEMA = 2  # raised when a key changes its name or its meaning
 
 
-def rates(runs: Sequence[Run]) -> dict[str, tuple[float, list[float] | None]]:
-    """Success rates with 95 % bootstrap intervals over objects, of which every episode has its own.
+def rates(runs: Sequence[Run]) -> dict[str, tuple[float | None, list[float] | None]]:
+    """Success rates with 95 % bootstrap intervals over objects, of the episodes that were drawn; None if none was.
 
     Args:
-        runs: episodes under one condition.
+        runs: episodes under one condition. Every generated object is another one; a user's mesh has several episodes.
     """
-    objects = [one.number for one in runs]
-    table = {}
-    for name in RATES:
-        values = np.array([getattr(one.outcome, name) for one in runs], float)
-        table[name] = float(values.mean()), bootstrap_interval(values, objects)
-    return table
+    return {name: _rate(runs, name) for name in RATES}
+
+
+def criteria(runs: Sequence[Run]) -> dict[str, tuple[float | None, list[float] | None]]:
+    """How often each criterion of the place holds, with intervals as of `rates`.
+
+    These are the criteria that the protocol of the condition has: R-NDF's in "teleport".
+
+    Args:
+        runs: episodes under one condition, at least one.
+    """
+    condition = runs[0].condition
+    return {name: _rate(runs, name) for name in CRITERIA if is_tested(name, condition)}
+
+
+def is_tested(criterion: str, condition: Condition) -> bool:
+    """Whether a criterion of the place is a part of what is measured.
+
+    Args:
+        criterion: one of `tdf_jax.sim.episode.CRITERIA`.
+        condition: what episodes are measured under.
+    """
+    if criterion in ("comes_off", "no_collision"):
+        return (criterion == "comes_off") == (condition.mode == "teleport")
+    if criterion in ("hung", "upright"):
+        return (criterion == "hung") == (TASKS[condition.task].object == "mug")
+    return True
+
+
+def _rate(runs: Sequence[Run], name: str) -> tuple[float | None, list[float] | None]:
+    used = [one for one in runs if one.outcome.drawn]
+    if not used:
+        return None, None
+    values = np.array([getattr(one.outcome, name) for one in used], float)
+    return float(values.mean()), bootstrap_interval(values, [one.object for one in used])
 
 
 def causes(runs: Sequence[Run]) -> dict[str, int]:
@@ -37,7 +79,22 @@ def causes(runs: Sequence[Run]) -> dict[str, int]:
     Args:
         runs: episodes under one condition.
     """
-    return dict(collections.Counter(one.outcome.cause for one in runs if one.outcome.cause).most_common())
+    failed = [one.outcome.cause for one in runs if one.outcome.drawn and one.outcome.cause]
+    return dict(collections.Counter(failed).most_common())
+
+
+def not_drawn(runs: Sequence[Run]) -> list[str]:
+    """What could not be drawn, and why, in words, the same thing once.
+
+    Args:
+        runs: episodes under one condition.
+    """
+    numbers: dict[str, list[int]] = {}
+    for one in runs:
+        if not one.outcome.drawn:
+            reason = re.sub(r"\(episode \d+, |of episode \d+ \(", "(", one.outcome.detail)
+            numbers.setdefault(f"{one.instance}{': ' * bool(one.instance)}{reason}", []).append(one.number)
+    return [f"{', '.join(map(str, several))}: {reason}" for reason, several in numbers.items()]
 
 
 def summary(runs: Sequence[Run]) -> str:
@@ -47,26 +104,33 @@ def summary(runs: Sequence[Run]) -> str:
         runs: episodes under one condition.
     """
     condition = runs[0].condition
+    used = [one for one in runs if one.outcome.drawn]
+    meshes = dict.fromkeys(one.instance for one in runs if one.instance)
     lines = [
         f"{condition.task}, target {condition.target}, {condition.poses}, {condition.mode}, {condition.clouds} clouds, "
         f"{condition.demonstrations} demonstration{'s' * (condition.demonstrations > 1)}, {condition.method}: "
-        f"{len(runs)} episodes"
+        f"{len(used)} episodes"
     ]
+    if meshes:
+        lines.append(f"  meshes: {', '.join(meshes)}")
+    lines += [f"  not drawn, and not counted: {words}" for words in not_drawn(runs)]
     for name, (rate, interval) in rates(runs).items():
         if name == "strict" and condition.task != "mug_on_rack":
             continue
         words = {"strict": "overall, hung by the handle"}.get(name, name)
         between = "" if interval is None else f" ({100 * interval[0]:.0f}-{100 * interval[1]:.0f})"
-        lines.append(f"  {words}: {100 * rate:.0f} %{between}")
+        lines.append(f"  {words}: {percent(rate)}{between}")
+    parts_of_place = ", ".join(f"{WORDS[name]} {percent(rate)}" for name, (rate, _) in criteria(runs).items())
+    lines.append(f"  of the place: {parts_of_place}")
     slips = np.array([[one.outcome.slip, one.outcome.turn] for one in runs])
     if np.isfinite(slips).any():
         slip, turn = np.nanmedian(slips, axis=0)
         lines.append(f"  moved in the hand, median: {1e3 * slip:.1f} mm, {turn:.1f} degrees")
     lines += [f"  failed: {cause}: {count}" for cause, count in causes(runs).items()]
-    parts = seconds(runs)
+    parts = seconds(used)
     rejected, redrawn = (sum(getattr(one, name) for one in runs) for name in ("rejected", "redrawn"))
     lines.append(f"  drawn before: {rejected} starts out of reach, {redrawn} pairs that do not fit")
-    for words, values in (("median", np.median(parts, axis=0)), ("all episodes", parts.sum(axis=0))):
+    for words, values in (("median", np.median(parts, axis=0)), ("all episodes", parts.sum(axis=0))) if used else ():
         named = (f"{name} {_seconds(value)}" for name, value in zip(PARTS, values))
         lines.append(f"  seconds, {words}: {', '.join(named)}")
     return "\n".join(lines)
@@ -80,7 +144,15 @@ def seconds(runs: Sequence[Run]) -> Float[np.ndarray, "episodes 3"]:
     Args:
         runs: the episodes.
     """
-    return np.array([(one.seconds[0], one.planning, one.seconds[1] - one.planning) for one in runs])
+    parts = [(one.seconds[0], one.planning, one.seconds[1] - one.planning) for one in runs]
+    return np.array(parts, float).reshape(-1, len(PARTS))
+
+
+def _value(run: Run, name: str, value):
+    """A field of an outcome in JSON; None for what is not known or not tested."""
+    if isinstance(value, float) and np.isnan(value):
+        return None
+    return None if name in CRITERIA and not is_tested(name, run.condition) else value
 
 
 def _seconds(value: float) -> str:
@@ -106,16 +178,18 @@ def record(settings: Settings, runs: Sequence[Run]) -> dict[str, Any]:
         "seed": settings.seed,
         "weights": {"object": settings.object_weights, "target": settings.target_weights},
         "rates": {name: {"rate": rate, "interval": interval} for name, (rate, interval) in rates(runs).items()},
+        "place_criteria": {
+            name: {"rate": rate, "interval": interval} for name, (rate, interval) in criteria(runs).items()
+        },
         "causes": causes(runs),
+        "not_drawn": [one.number for one in runs if not one.outcome.drawn],
         "episodes": [
             {
                 "number": one.number,
                 "rejected": one.rejected,
                 "redrawn": one.redrawn,
-                **{
-                    name: None if isinstance(value, float) and np.isnan(value) else value
-                    for name, value in dataclasses.asdict(one.outcome).items()
-                },
+                "mesh": one.instance or None,
+                **{name: _value(one, name, value) for name, value in dataclasses.asdict(one.outcome).items()},
             }
             for one in runs
         ],

@@ -29,6 +29,7 @@ from tdf_jax.sim.collision import Collisions
 from tdf_jax.sim.grasps import Grip, grip_of
 from tdf_jax.sim.kinematics import kinematics_of
 from tdf_jax.sim.robot import Robot
+from tdf_jax.sim.scans import Scan
 from tdf_jax.sim.swing import level_rotations
 from tdf_jax.sim.workcell import build_workcell
 
@@ -74,6 +75,21 @@ TASKS = {
 }
 
 
+class NotDrawn(InputError):
+    """Raised if an episode cannot be drawn.
+
+    Attributes:
+        rejected, redrawn: numbers of starts and pairs that were drawn; see `Episode`.
+    """
+
+    def __init__(self, message: str, rejected: int = 0, redrawn: int = 0):
+        super().__init__(message)
+        self.rejected, self.redrawn = rejected, redrawn
+
+    def __reduce__(self):
+        return NotDrawn, (str(self), self.rejected, self.redrawn)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Episode:
     """What is drawn of an episode.
@@ -82,7 +98,7 @@ class Episode:
         task: name in `TASKS`.
         number: number of the episode.
         poses: how the object starts, one of `POSES`.
-        object: the object, in its canonical frame.
+        object: the object, in its canonical frame: generated, or of a user's mesh.
         target: the target, in its canonical frame; it stands upright.
         T_world_object: pose of the object at the start, 4x4, metres, world frame.
         T_world_target: pose of the target, 4x4.
@@ -96,7 +112,7 @@ class Episode:
     task: str
     number: int
     poses: str
-    object: Shape
+    object: Shape | Scan
     target: Shape | Board
     T_world_object: Float[np.ndarray, "4 4"]
     T_world_target: Float[np.ndarray, "4 4"]
@@ -109,7 +125,7 @@ class Episode:
     @functools.cached_property
     def object_body(self) -> Body:
         """The object's body for the physics."""
-        return body_of(self.object)
+        return _body(self.object)
 
     @functools.cached_property
     def target_body(self) -> Body:
@@ -133,7 +149,13 @@ class Episode:
 
 
 def draw_episode(
-    task: str, robot: Robot, seed: int, number: int, poses: str = "upright", known: Episode | None = None
+    task: str,
+    robot: Robot,
+    seed: int,
+    number: int,
+    poses: str = "upright",
+    known: Episode | None = None,
+    scan: Scan | None = None,
 ) -> Episode:
     """Draw an episode: the pair, and a start from which the true pick and the true release are within reach.
 
@@ -145,27 +167,39 @@ def draw_episode(
         poses: "upright" on the table with any yaw; "tilt60" with roll and pitch within 60 degrees too, or "uniform",
             both held by a fixture above the table.
         known: the demonstrated episode, if its target is to stand where it stood; otherwise another target is drawn.
+        scan: the object, of the task's category, if it is not to be generated.
 
     Raises:
-        InputError: there is no such task or poses, or nothing within reach is drawn.
+        NotDrawn: nothing within reach is drawn, or the object of `scan` fits neither the fingers nor a target.
+        InputError: there is no such task or poses.
     """
     checks.choice("draw_episode()", "task", task, TASKS)
     checks.choice("draw_episode()", "poses", poses, POSES)
     rejected = redrawn = 0
+    what = task if scan is None else f"{task} with {scan.name}"
     for other in range(MOST_PAIRS):
-        drawn = _pair(task, seed, number + other * OTHER_PAIRS, None if known is None else known.target)
-        if drawn is None:
-            redrawn += 1
-            continue
-        one, target, T_target_object, T_target_contact, unfit = drawn
-        redrawn += unfit
-        rng = np.random.default_rng([SEED_SPACE, seed, number + other * OTHER_PAIRS, 7])
         try:
-            grip = grip_of(one, robot.fingers)
-        except InputError:  # nothing of it fits between the fingers
+            drawn = _pair(task, seed, number + other * OTHER_PAIRS, None if known is None else known.target, scan)
+            if drawn is None:
+                redrawn += 1
+                if scan is not None:  # neither the object nor the target changes
+                    raise InputError("the known target does not fit the object")
+                continue
+            one, target, T_target_object, T_target_contact, unfit = drawn
+            redrawn += unfit
+            grip = grip_of(cast(Shape, one), robot.fingers)
+        except InputError as error:  # nothing of it fits between the fingers, or no target fits it
+            if scan is not None:
+                raise NotDrawn(
+                    f"draw_episode(): there is no {what} (episode {number}, seed {seed}): {error}; expected an object "
+                    "that fits the gripper and the target",
+                    rejected,
+                    redrawn,
+                ) from None
             redrawn += 1
             continue
-        bodies = {"object_body": body_of(one), "target_body": body_of(target)}
+        rng = np.random.default_rng([SEED_SPACE, seed, number + other * OTHER_PAIRS, 7])
+        bodies = {"object_body": _body(one), "target_body": body_of(target)}
         # One cell, in which the bodies are moved from start to start.
         cell = build_workcell(robot, bodies["object_body"], None, bodies["target_body"], None, fixed_target=False)
         collisions = Collisions(cell)
@@ -191,10 +225,16 @@ def draw_episode(
                     return tried
             rejected += 1
         redrawn += 1
-    raise InputError(
-        f"draw_episode(): no {task} of episode {number} (seed {seed}) is within reach of {robot.name} in {MOST_PAIRS} "
-        f"pairs of {STARTS} starts each; expected a robot that reaches the table"
+    raise NotDrawn(
+        f"draw_episode(): no {what} of episode {number} (seed {seed}) is within reach of {robot.name} in {MOST_PAIRS} "
+        f"pairs of {STARTS} starts each; expected a robot that reaches the table",
+        rejected,
+        redrawn,
     )
+
+
+def _body(one: Shape | Scan) -> Body:
+    return one.body if isinstance(one, Scan) else body_of(one)
 
 
 def within_reach(episode: Episode, robot: Robot, collisions: Collisions) -> bool:
@@ -281,26 +321,28 @@ def _level(path: Trajectory) -> Trajectory:
     return Trajectory.from_matrices(jnp.asarray(poses))
 
 
-def _pair(task: str, seed: int, number: int, target: Shape | Board | None):
+def _pair(task: str, seed: int, number: int, target: Shape | Board | None, scan: Scan | None):
     """An object, a target, the seated pose, the contact frame, and how many pairs did not fit; None if these do not."""
+    given = cast(Shape | None, scan)  # it has what is asked of a shape here
     if task in RELATIONS and target is None:
-        pair = draw_pair(task, seed, number)
+        pair = draw_pair(task, seed, number, given)
         return pair.object, pair.target, pair.T_target_object, pair.T_target_contact, pair.redrawn
-    family = FAMILIES[TASKS[task].object]
-    one = family.build(family.sample(np.random.default_rng([SEED_SPACE, seed, number, 3])))
+    if given is None:
+        family = FAMILIES[TASKS[task].object]
+        given = cast(Shape, family.build(family.sample(np.random.default_rng([SEED_SPACE, seed, number, 3]))))
     if task in RELATIONS:
         assert isinstance(target, Shape)
-        seated = RELATIONS[task].seat(one, target)
-        return None if seated is None else (one, target, *seated, 0)
+        seated = RELATIONS[task].seat(given, target)
+        return None if seated is None else (given, target, *seated, 0)
     board = Board()
     top = np.eye(4)
     top[2, 3] = board.mesh.bounds[1, 2]
     standing = top.copy()
-    standing[2, 3] -= one.mesh.bounds[0, 2]
-    return one, board, standing, top, 0
+    standing[2, 3] -= given.mesh.bounds[0, 2]
+    return given, board, standing, top, 0
 
 
-def _start(one: Shape, poses: str, rng) -> np.ndarray:
+def _start(one: Shape | Scan, poses: str, rng) -> np.ndarray:
     if poses == "upright":
         return _standing(one.mesh, OBJECTS, rng)
     T = np.eye(4)

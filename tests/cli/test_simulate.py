@@ -54,6 +54,8 @@ def refusal(tmp_path, capsys, monkeypatch):
         (["--target-weights", "nothing.safetensors"], "nothing.safetensors"),
         (["--task", "mug_on_mug"], "mug_on_mug"),
         (["--pose", "sideways"], "sideways"),
+        (["--recursive"], "--recursive is of --meshes; expected both, or neither"),
+        (["--meshes", "nowhere"], "there is no folder nowhere"),
     ],
     ids=lambda value: "" if isinstance(value, str) else " ".join(map(str, value))[:40],
 )
@@ -64,7 +66,10 @@ def test_bad_input_is_refused_at_once(refusal, words, message):
 def test_a_target_without_weights_is_refused(refusal, monkeypatch):
     monkeypatch.setattr("tdf_jax.cli.simulate._shipped", lambda category: None)
     error = refusal("--task", "mug_on_rack", "--target", "found")
-    assert "there are no shipped weights of a rack; expected --target known, or --target-weights FILE" in error
+    assert (
+        "there are no weights of a rack, which is to be found; expected --target known, or --target-weights FILE"
+        in error
+    )
 
 
 def test_an_output_folder_that_is_a_file_is_refused(refusal, tmp_path):

@@ -15,6 +15,7 @@ from tdf_jax.sim.campaign import TRUTH, Condition, Settings, centred_path, check
 from tdf_jax.sim.episode import Outcome
 from tdf_jax.sim.recording import check_film
 from tdf_jax.sim.report import record
+from tdf_jax.sim.tasks import NotDrawn
 
 SHELF = Condition("bowl_on_shelf", "known", "upright", "execute", method=TRUTH)
 
@@ -160,7 +161,7 @@ def test_an_outcome_without_motion_is_kept_and_cannot_be_filmed(bench, tmp_path,
     monkeypatch.setattr(campaign, "_bench", lambda settings: made)
     first, again = (run_one(made.settings, 0) for _ in range(2))
     assert first.outcome.cause == again.outcome.cause == "not found" and first.outcome.detail == again.outcome.detail
-    with pytest.raises(InputError, match=r"episode 0 has no motion to film: relate\(\): the clouds are far apart"):
+    with pytest.raises(InputError, match=r"episode 0 has no motion: relate\(\): the clouds are far apart"):
         campaign.film_one(made.settings, 0, tmp_path / "film.gif")
 
 
@@ -187,13 +188,62 @@ def test_the_times_of_an_episode_are_apart(bench, monkeypatch):
     assert run.seconds == (2.0, 12.0) and run.planning == 4.0
 
 
-def test_outcomes_of_an_earlier_version_are_read(bench, monkeypatch):
+@pytest.mark.parametrize("where", ["episode", "found"], ids=["the episode", "its demonstration"])
+def test_an_episode_that_cannot_be_drawn_ends_no_campaign(bench, monkeypatch, where):
+    """It is kept as what it is, with the starts that were tried."""
+
+    def nothing(self, *about):
+        raise NotDrawn("draw_episode(): no bowl_on_shelf is within reach", 25, 1)
+
+    monkeypatch.setattr(campaign._Bench, where, nothing)
     made = bench()
-    old = {**dataclasses.asdict(Outcome.failure("unreachable", "far")), "rejected": 1, "redrawn": 0, "seconds": (2, 9)}
-    monkeypatch.setattr(made, "run", lambda number: old)
     monkeypatch.setattr(campaign, "_bench", lambda settings: made)
-    run = run_one(made.settings, 0)
-    assert run.seconds == (2.0, 9.0) and np.isnan(run.planning) and run.outcome.cause == "unreachable"
+    first, again = (run_one(made.settings, 0) for _ in range(2))
+    assert repr(first) == repr(again) and first.outcome.cause == "not drawn" and not first.outcome.drawn
+    assert (first.rejected, first.redrawn) == (25, 1) and "within reach" in first.outcome.detail
+    with pytest.raises(InputError, match="episode 0 has no motion: draw_episode"):
+        campaign.found_in(made.settings, 0)
+
+
+def test_a_demonstration_that_cannot_be_drawn_is_tried_once(bench, monkeypatch):
+    calls = []
+
+    def nothing(*arguments):
+        calls.append(arguments)
+        raise NotDrawn("none is within reach")
+
+    monkeypatch.setattr("tdf_jax.sim.tasks.draw_episode", nothing)
+    made = bench()
+    for _ in range(2):
+        with pytest.raises(NotDrawn, match=r"none is within reach \(of the demonstrations\)"):
+            made.shown(3)
+    assert len(calls) == 1
+
+
+def test_what_was_imitated_is_kept(bench, monkeypatch):
+    paths, motion = np.random.default_rng(0).normal(size=(2, 3, 4, 4)), np.diag([1.0, 1, 1, 1])
+    monkeypatch.setattr(campaign._Bench, "found", lambda self, episode, shown: (list(paths), motion))
+    far = Outcome.failure("unreachable", "far")
+    monkeypatch.setattr("tdf_jax.sim.episode.run_episode", lambda *arguments, **keywords: far)
+    made = bench()
+    monkeypatch.setattr(campaign, "_bench", lambda settings: made)
+    assert run_one(made.settings, 0).outcome.cause == "unreachable"
+    monkeypatch.setattr(campaign._Bench, "found", lambda *about: pytest.fail("it is imitated again"))
+    _, _, kept_paths, kept_motion = campaign.found_in(made.settings, 0)
+    np.testing.assert_array_equal(kept_paths, paths)
+    np.testing.assert_array_equal(kept_motion, motion)
+
+
+def test_a_found_target_needs_weights_and_meshes_their_folder(tmp_path):
+    found = settings(tmp_path, SHELF._replace(task="bowl_on_mug", target="found", method=campaign.LIBRARY))
+    with pytest.raises(
+        InputError, match="there are no weights of a mug, which is to be found; expected --target known"
+    ):
+        next(run_campaign(found, 1, progress=False))
+    campaign.check_settings(dataclasses.replace(found, target_weights="mug"))
+    campaign.check_settings(dataclasses.replace(found, condition=found.condition._replace(method=TRUTH)))
+    with pytest.raises(InputError, match="objects is 'meshes' and meshes is None; expected a folder for 'meshes'"):
+        next(run_campaign(settings(tmp_path, SHELF._replace(objects="meshes")), 1, progress=False))
 
 
 def test_wrong_weights_are_no_failure_of_an_episode(bench, monkeypatch):
@@ -207,11 +257,11 @@ def test_the_processes_leave_no_setting_behind(monkeypatch):
     import os
 
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_parallel_codegen_split_count=1")
-    with campaign._pool(1):
+    with campaign.process_pool(1):
         assert "eigen=false" in os.environ["XLA_FLAGS"] and "split_count" in os.environ["XLA_FLAGS"]
     assert os.environ["XLA_FLAGS"] == "--xla_cpu_parallel_codegen_split_count=1"
     monkeypatch.delenv("XLA_FLAGS")
-    with campaign._pool(1):
+    with campaign.process_pool(1):
         pass
     assert "XLA_FLAGS" not in os.environ
 

@@ -74,6 +74,11 @@ def test_only_what_can_be_measured_is_combined():
     assert {(row.target, row.method) for row in ten} == {("found", "tdf_jax")} and len(ten) == 3 * 2
 
 
+def test_meshes_are_beside_generated_objects():
+    rows = planned(objects=("generated", "meshes"))
+    assert len(rows) == 24 and {row.objects for row in rows} == {"generated", "meshes"}
+
+
 def test_only_teleported_objects_are_light():
     rows = planned(light=True)
     assert {(row.mode, row.mass) for row in rows} == {("teleport", LIGHT_MASS), ("execute", 0.0)}
@@ -150,6 +155,41 @@ def test_failures_draws_and_times_are_in_the_page(row):
     assert [times[name] for name in ("imitation", "planning", "physics")] == ["4.0", "5.0", "17.0"]
     assert times["all episodes, minutes"] == "2.2"  # 20, 25 and 85 s
     assert "imitation 15 %, planning 19 %, physics 65 %." in text
+
+
+def test_criteria_of_the_place_stand_apart(row):
+    placed = dataclasses.replace(GOOD, touches=True, off_table=True, settled=True, comes_off=True, hung=True)
+    stuck = dataclasses.replace(FELL, touches=True, off_table=True, settled=True, hung=True)
+    (one,) = table(page([row(placed, stuck)], SETTINGS), "## Criteria of the place")
+    assert one["comes off upside down"] == "50 % (0 to 100)" and one["settled"] == "100 % (100 to 100)"
+    assert one["upright"] == one["no collision"] == ""  # a mug that is teleported
+
+
+def test_meshes_have_rows_of_their_own_beside_generated_objects(row):
+    real = row(GOOD, FELL, GOOD, FELL, objects="meshes")
+    runs = [dataclasses.replace(one, instance=("cup", "jug")[n % 2]) for n, one in enumerate(real.all)]
+    lost = dataclasses.replace(runs[1], number=4, outcome=Outcome.failure("not drawn", "too thick"))
+    real = Row(real.settings, [*runs, lost])
+    text = page([row(*[GOOD] * 40), real], SETTINGS)
+    ours, theirs = table(text, "### Teleported: mug on rack")
+    assert (ours["poses"], theirs["poses"]) == ("upright", "upright, meshes") and theirs["episodes"] == "4"
+    assert theirs["overall"] == "50 % (0 to 100)"
+    assert (
+        "40 episodes a row, each with an unseen generated object; rows of meshes have episodes of cup, jug in turn"
+        in text
+    )
+    assert "- Not drawn, and not counted: 4: jug: too thick." in text
+    assert "above it in 0 of 1 rows" in text  # published rates are compared with generated objects alone
+    assert real.likely("overall") == (0, 1) and record([real], SETTINGS)["rows"][0]["not_drawn"] == [4]
+
+
+def test_a_row_of_which_nothing_was_drawn_says_so(row):
+    text = page([row(GOOD, GOOD), row(*[Outcome.failure("not drawn", "far")] * 2, poses="tilt60")], SETTINGS)
+    _, empty = table(text, "### Teleported: mug on rack")
+    assert empty["episodes"] == "0" and empty["overall"] == "n/a"
+    assert "- Not drawn, and not counted: 0, 1: far." in text
+    assert "![The first failed" not in text
+    assert "![The first failed episode of each cause](a.png)" in page([row(GOOD)], SETTINGS, "a.png")
 
 
 def test_times_that_are_not_known_are_said_to_be_unknown(row):
@@ -253,7 +293,7 @@ def test_a_record_is_the_same_on_a_rerun_but_for_times_and_the_machine(row):
     assert first["moved_in_hand_median"] == {"metres": 0.002, "degrees": 1.0}
     assert first["episodes"][1]["cause"] == "unreachable" and made["settings"]["seed"] == 3
     for one in rows:
-        one.runs[:] = [
+        one.all[:] = [
             Run(run.condition, run.number, run.outcome, run.rejected, run.redrawn, (9.0, 9.0)) for run in one.runs
         ]
     again = json.loads(json.dumps(record(rows, SETTINGS)))

@@ -1,5 +1,6 @@
 """The report of a campaign: rates, causes and the record, of outcomes that are known."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 from tdf_jax.sim.campaign import Condition, Run, Settings
 from tdf_jax.sim.episode import Outcome
-from tdf_jax.sim.report import causes, rates, record, summary
+from tdf_jax.sim.report import causes, criteria, not_drawn, rates, record, summary
 
 CONDITION = Condition("mug_on_rack", "known", "upright", "execute")
 GOOD = Outcome(True, True, True, True, "", "", 0.002, 1.0)
@@ -36,6 +37,45 @@ def test_rates_count_every_episode(runs):
 
 def test_causes_are_counted_the_most_frequent_first(runs):
     assert list(causes(runs).items()) == [("fell", 2), ("not on the peg", 1), ("unreachable", 1)]
+
+
+def test_criteria_of_the_place_are_those_of_the_protocol(runs, tmp_path):
+    on_peg = dataclasses.replace(GOOD, touches=True, off_table=True, settled=True, hung=True, no_collision=True)
+    runs[0] = dataclasses.replace(runs[0], outcome=on_peg)
+    table = criteria(runs)
+    assert list(table) == ["touches", "off_table", "settled", "hung", "no_collision"] and table["hung"][0] == 1 / 8
+    made = record(Settings(CONDITION, "mug", None, 7, tmp_path), runs)
+    assert made["place_criteria"]["settled"]["rate"] == 1 / 8
+    first = made["episodes"][0]
+    assert first["touches"] is True and first["comes_off"] is first["upright"] is None  # which nothing tests here
+    bowl = [dataclasses.replace(runs[0], condition=CONDITION._replace(task="bowl_on_mug", mode="teleport"))]
+    assert list(criteria(bowl)) == ["touches", "off_table", "settled", "upright", "comes_off"]
+    assert "touches the target 12 %, not the table 12 %, settled 12 %, hung by the handle 12 %" in summary(runs)
+
+
+def test_what_was_not_drawn_is_named_and_not_counted(runs, tmp_path):
+    before = rates(runs)
+    for number, mesh in ((8, "cup"), (9, "cup")):
+        detail = f"draw_episode(): there is no mug_on_rack with cup (episode {number}, seed 3): too thick"
+        runs.append(Run(CONDITION, number, Outcome.failure("not drawn", detail), 0, 1, (0.0, 0.0), 0.0, mesh))
+    assert rates(runs) == before and "not drawn" not in causes(runs)
+    (words,) = not_drawn(runs)
+    assert words == "8, 9: cup: draw_episode(): there is no mug_on_rack with cup (seed 3): too thick"
+    assert f"  not drawn, and not counted: {words}" in (text := summary(runs)) and "tdf_jax: 8 episodes" in text
+    made = json.loads(json.dumps(record(Settings(CONDITION, "mug", None, 7, tmp_path), runs), allow_nan=False))
+    assert made["not_drawn"] == [8, 9] and made["episodes"][9]["mesh"] == "cup"
+    nothing = record(Settings(CONDITION, "mug", None, 7, tmp_path), runs[8:])
+    assert nothing["rates"]["overall"] == {"rate": None, "interval": None} and "overall: n/a" in summary(runs[8:])
+
+
+def test_intervals_are_over_meshes(runs):
+    """Four episodes of each of two meshes are two objects."""
+    outcomes = [GOOD] * 4 + [FELL] * 4
+    runs = [
+        dataclasses.replace(one, outcome=new, instance="ab"[n // 4]) for n, (one, new) in enumerate(zip(runs, outcomes))
+    ]
+    assert rates(runs)["overall"] == (0.5, [0.0, 1.0])
+    assert rates(runs[:4])["overall"] == (1.0, None)  # of one object there is none
 
 
 def test_a_summary_says_all_of_it(runs):
