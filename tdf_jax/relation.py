@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import host
@@ -20,10 +20,10 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Contact, Reference, describe
 from tdf_jax.energy.residual import pick_residual
-from tdf_jax.energy.seating import touch_distance
+from tdf_jax.energy.seating import overlap, touch_distance
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration, check_apart
-from tdf_jax.geometry.registration import refine_regions
+from tdf_jax.geometry.registration import refine_region
 from tdf_jax.geometry.sampling import subset
 from tdf_jax.geometry.trajectory import Trajectory, resample
 from tdf_jax.geometry.transport import arrival_depth, carry_to_target
@@ -45,8 +45,11 @@ MAX_POSES = 200  # of a path that is made denser; one of more than 2 m has wider
 # seated.
 MAX_TOUCH_DISTANCE = 0.01
 # Half edge of the region that is registered, a factor on the spread of the contact points along an axis: of points in a
-# box, 0.8 of its edge.
-REGION = 1.4
+# box, 0.6 of half its edge. A larger one reaches from the middle of a short peg to its post.
+REGION = 1.05
+AS_FREE = (
+    0  # points of the target that may be in the object: with a displacement that frees it, those of the contact are not
+)
 REGISTERED = 4000  # most points of a cloud that are registered; more would cost up to minutes
 MAX_SOLUTIONS = 25  # candidates of a result: distinct picks times distinct motions of the object
 
@@ -72,7 +75,7 @@ class Objects:
 
 @dataclasses.dataclass(frozen=True)
 class Relations:
-    """Distinct motions of an object to a target, the best first.
+    """Distinct motions of an object to a target, the best first: those that touch it, by their energies, then others.
 
     Attributes:
         target_contacts: poses X_t of the contact frame on the target, world frame, (solutions, 7).
@@ -89,6 +92,12 @@ class Relations:
     energies: Float[np.ndarray, " solutions"]
     seatings: Float[np.ndarray, "solutions 3"]
     target_residual: float
+
+    @property
+    def untouched(self) -> Bool[np.ndarray, " solutions"]:
+        """Whether a motion does not bring the object to its target although others do."""
+        missed = np.isnan(self.seatings).any(axis=1)
+        return np.asarray(missed & ~missed.all())
 
     @property
     def motions(self) -> Float[Array, "solutions 7"]:
@@ -279,7 +288,7 @@ def find_relations(
             config,
         )
         residual = pick_residual(float(target_energies[0]), contact.target_descriptors)
-        on_target = _registered(on_target, contact, np.asarray(objects.target_points))
+        on_target = _registered(on_target, on_object[0], objects, contact)
         # Several may now be one.
         modes = cluster_poses(jnp.asarray(on_target), jnp.asarray(target_energies))
         on_target, target_energies = (
@@ -291,31 +300,46 @@ def find_relations(
     rows, columns = np.unravel_index(order, energies.shape)
     unseated = np.full((len(rows), 3), np.nan, np.float32)
     found = Relations(on_target[rows], on_object[columns], energies[rows, columns], unseated, residual)
-    return dataclasses.replace(found, seatings=_seatings(objects, found, contact)) if seat else found
+    return _seated(objects, found, contact) if seat else found
 
 
 def _registered(
-    contacts: Float[np.ndarray, "contacts 7"], contact: Contact, points: Float[np.ndarray, "points 3"]
+    contacts: Float[np.ndarray, "contacts 7"], on_object: Float[np.ndarray, "7"], objects: Objects, contact: Contact
 ) -> Float[np.ndarray, "contacts 7"]:
     """Contact poses on the target, refined by the points of both clouds in the region.
 
-    Descriptors know where the region is, but little of its own shape: on a rack they give the height and the tilt of a
-    common peg rather than of this one, or the side without a peg.
+    Descriptors know where the region is and how it is turned, but little of its own shape: on a rack they give the
+    height and the tilt of a common peg rather than of this one. Where several poses fit, as along a peg, the nearest is
+    taken with which the object, at its best contact pose, does not overlap the target.
     """
     query = np.asarray(contact.query, float)
     T_contact_region = np.eye(4)  # the contact frame may be the world, far from its points
     T_contact_region[:3, 3] = query.mean(axis=0)
     radius = REGION * float(np.sqrt(np.mean((query - query.mean(axis=0)) ** 2)))
     T_region_world = np.linalg.inv(_matrix(contact.T_world_contact) @ T_contact_region)
-    shown, points = (subset(np.asarray(cloud, float), REGISTERED) for cloud in (contact.target_points, points))
+    shown, points = (
+        subset(np.asarray(cloud, float), REGISTERED) for cloud in (contact.target_points, objects.target_points)
+    )
     demonstrated = shown @ T_region_world[:3, :3].T + T_region_world[:3, 3]
-    given = np.stack([_matrix(pose) @ T_contact_region for pose in contacts])
-    refined = refine_regions(demonstrated, points, given, radius)
     back = np.linalg.inv(T_contact_region)
-    poses = [
-        pose if (T == start).all() else np.asarray(se3.pose((T @ back)[:3, :3], (T @ back)[:3, 3]))
-        for pose, start, T in zip(contacts, given, refined, strict=True)
-    ]
+    T_contact_world = np.linalg.inv(_matrix(on_object))
+    poses = []
+    for pose in contacts:
+        given = _matrix(pose) @ T_contact_region
+        refined = refine_region(demonstrated, points, given, radius)
+        if (refined[0] == given).all():
+            poses.append(np.asarray(pose))
+            continue
+        free, least = refined[0], np.inf
+        for T in refined:
+            down = (T @ back)[:3, :3] @ np.asarray(contact.down, float)
+            inside = overlap(objects.field, points, T @ back @ T_contact_world, down)
+            if inside < least - AS_FREE:
+                free, least = T, inside
+            if least <= AS_FREE:
+                break
+        T = free @ back
+        poses.append(np.asarray(se3.pose(T[:3, :3], T[:3, 3])))
     return np.stack(poses).astype(contacts.dtype)
 
 
@@ -323,18 +347,29 @@ def _matrix(pose) -> Float[np.ndarray, "4 4"]:
     return np.asarray(Trajectory(jnp.asarray(pose)[None]).matrices[0], float)
 
 
-def _seatings(objects: Objects, found: Relations, contact: Contact) -> Float[np.ndarray, "solutions 3"]:
-    """Displacements of the placed object until it touches the target; NaN where it does not."""
+def _seated(objects: Objects, found: Relations, contact: Contact) -> Relations:
+    """The relations with displacements of the placed object until it touches the target, those that touch first."""
     if not abs(float(contact.touch)) <= MAX_TOUCH_DISTANCE:  # also where it is not known
-        return found.seatings
+        return found
     target_points = contact.target_points if objects.target_points is None else objects.target_points
     rotations = se3.rotation(jnp.asarray(found.target_contacts))
     directions = np.asarray(rotations @ contact.down, float)
-    distances = [
-        touch_distance(objects.field, objects.target, objects.points, target_points, motion, direction)
-        for motion, direction in zip(found.motions, directions, strict=True)
-    ]
-    return (np.array(distances)[:, None] * directions).astype(np.float32)
+    distances = np.array(
+        [
+            touch_distance(objects.field, objects.target, objects.points, target_points, motion, direction)
+            for motion, direction in zip(found.motions, directions, strict=True)
+        ]
+    )
+    # One that does not touch its target anywhere near, or cannot come free of it, is not what was demonstrated.
+    order = np.argsort(np.isnan(distances), kind="stable")
+    seatings = (distances[:, None] * directions).astype(np.float32)
+    return dataclasses.replace(
+        found,
+        target_contacts=found.target_contacts[order],
+        object_contacts=found.object_contacts[order],
+        energies=found.energies[order],
+        seatings=seatings[order],
+    )
 
 
 def distinct_contacts(
@@ -412,7 +447,9 @@ def carry_object(
     distinct = np.array([mode.members[0] for mode in modes]) if modes else np.arange(len(picks))
     pick_energies = np.where(np.asarray(picked.finite), np.asarray(picked.energies), np.inf)[distinct]
     joint = pick_energies[:, None] + relations.energies
-    order = np.argsort(joint, axis=None, kind="stable")[:MAX_SOLUTIONS]
+    # First the motions that touch the target, as in `relations`; each pick goes with every motion.
+    untouched = np.broadcast_to(relations.untouched, joint.shape)
+    order = np.lexsort((joint.ravel(), untouched.ravel()))[:MAX_SOLUTIONS]
     rows, columns = np.unravel_index(order, joint.shape)
     energies, rows = joint[rows, columns], distinct[rows]
     contact, points = reference.contact, np.asarray(objects.points, float)

@@ -24,8 +24,10 @@ NEIGHBOURS = 4  # points half way to the nearest neighbours are tested too: few 
 BESIDE = 0.01  # metres across the direction within which a point may meet the other object
 SIDEWAYS = 2.0  # weight of the distance across the direction when those points are chosen
 POINTS = 512  # points of each object that are tested
+INSIDE, OVERLAP_STEPS = 0.2, (-0.7, -0.35, 0.0, 0.35, 0.7)  # occupancy that is too near; tested shares of `REACH`
 CLOUD = 2000  # points of each cloud that are looked at; more cost time and memory
 CLOSEST = 1e-4  # metres; nearer points weigh no more
+MARGIN = 6e-4  # metres; the surface between the tested points touches so much earlier in the median
 TINY = 1e-4  # occupancies are this far from 0 and 1 at least
 PADDING = 2048  # the points are filled up to a multiple of it, so that few programs are compiled
 
@@ -67,7 +69,30 @@ def touch_distance(
     depths = [_depth(field, cloud, (target_near - shifts - t) @ R, OBJECT_LEVELS)]
     if target is not None:
         depths.append(_depth(target, subset(target_points, CLOUD), near + shifts, TARGET_LEVELS))
-    return _first_touch(steps, np.max(depths, axis=0))
+    return _first_touch(steps, np.max(depths, axis=0)) - MARGIN
+
+
+def overlap(
+    field: DescriptorField,
+    target_points: Float[np.ndarray, "target_points 3"],
+    motion: Float[np.ndarray, "4 4"],
+    direction: Float[Array | np.ndarray, "3"],
+) -> int:
+    """How many points of a target are in or close to a placed object, wherever it is raised or lowered to.
+
+    Args:
+        field: field of the object in its initial pose.
+        target_points: cloud of the target, (target_points, 3), metres, world frame.
+        motion: motion of the object to the target, 4x4, metres.
+        direction: unit vector along which the object may be moved, (3,), world frame.
+
+    Returns:
+        The least number of points, of at most `CLOUD`, at displacements of up to `REACH`.
+    """
+    x = subset(np.asarray(target_points, float), CLOUD)
+    shifts = np.array(OVERLAP_STEPS)[:, None, None] * REACH * np.asarray(direction, float)
+    local = (x - shifts - motion[:3, 3]) @ motion[:3, :3]
+    return int((_occupancy(field, local.reshape(-1, 3)).reshape(len(shifts), -1) > INSIDE).sum(axis=1).min())
 
 
 def _denser(points: np.ndarray) -> np.ndarray:

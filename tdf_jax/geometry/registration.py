@@ -1,5 +1,7 @@
 """Registration of a region: the rigid motion that brings the points of one cloud near a place onto another cloud."""
 
+import itertools
+
 import numpy as np
 from jaxtyping import Float
 
@@ -7,21 +9,23 @@ ROUNDS = 40
 LEAST = 8  # points of either cloud in the region; with fewer there is nothing to register
 WIDER = 1.6  # region of the other cloud, a factor on the radius: its points may still move into the region
 CONVERGED = 1e-5  # metres and radians, movement of a round at which the registration ends
-# What a registration must bring the distance of the clouds in the region to: a factor on what it was, and a factor on
-# the half edge. On development pairs these were 0.2 to 0.9 and 0.06 to 0.14 for the pegs of racks; for the rims of mugs
-# and the floors of containers, whose sizes differ, 0.6 to 1.5 and mostly 0.13 to 0.33.
-FITS_BETTER, FITS = 0.8, 0.12
-SHIFTS = (-1.0, -0.5, 0.5, 1.0)  # of further starts along each axis, factors on the half edge
+# Weight of the given orientation, in mean square distances of one half edge. Along a peg the points weigh ten times as
+# much, about it a fifth: a peg looks the same from all sides, and descriptors know how it is turned.
+PRIOR = 0.02
+SHIFTS = (-1.3, -0.65, 0.0, 0.65, 1.3)  # of the starts along each axis, factors on the half edge
 SEARCHED = 20  # starts that are registered, those with the smallest distances
-# What a pose from a further start must bring the distance to: a factor on that of the first pose, and a factor on the
-# half edge. On 50 development racks these were 0 to 0.5 and 0.07 to 0.16; on 40 mugs and containers, where most such
-# poses are wrong, 0.52 and more.
-FITS_MUCH_BETTER, FITS_NEARLY = 0.5, 0.16
-# A region such as a peg's may fit as well after turns. They are tried about each axis, and what is around the region
-# decides: a cube so many times as large. A turned pose may fit a little worse.
-SURROUNDINGS = 3.0
-TURNS, AS_GOOD = np.radians(np.arange(30, 360, 30)), 1.4
-SMALL_TURNS, AS_GOOD_UNMOVED = np.radians([-20, -10, -5, 5, 10, 20]), 1.15
+MOST_TURN = np.radians(35)  # from the given orientation
+# What a registration must bring the distance of the clouds in the region to: a factor on what it was, and a factor on
+# the half edge, where it moved by at most a factor on the half edge. On 90 development racks the first factor was 0.1
+# to 0.6 wherever the given pose was off its peg; on 40 rims of mugs and floors of containers, whose sizes differ, 0.63
+# to 1 but for one that had moved by 65 mm.
+FITS_BETTER, FITS, NEAR = 0.6, 0.22, 1.6
+FITS_A_LITTLE_BETTER, FITS_WELL, NEARBY = 0.75, 0.12, 0.65
+# Factors on the least distance: up to the first, the nearest place is taken; up to the second, others beside it are
+# returned too, these shares of the half edge away.
+AS_GOOD, NEARLY_AS_GOOD = 1.1, 1.6
+STEPS = (0.15, 0.3, 0.5, 0.7)
+SURROUNDINGS = 1.35  # region that says how well a pose fitted, a factor, where there is nothing in the region itself
 
 
 def register_region(
@@ -34,7 +38,8 @@ def register_region(
 
     Every point of the demonstrated region is paired with the nearest new point, and every new point in the region with
     the nearest demonstrated one. No pair is left out as an outlier, because those at an end, such as a peg's tip, say
-    where the region is along it.
+    where the region is along it. The orientation from which it starts has a small weight, which decides how a region
+    such as a peg is turned about its axis.
 
     Args:
         demonstrated: cloud in the frame of the region, (points, 3), metres.
@@ -62,89 +67,77 @@ def register_region(
             return start
         before = np.concatenate([region, demonstrated[tree.query(inner)[1]]])
         after = np.concatenate([near[KDTree(near).query(region)[1]], inner])
-        motion = _motion(before, after)
+        motion = _motion(before, after, PRIOR * radius**2 * start[:3, :3].T @ T[:3, :3])
         T = T @ motion
         if np.abs(motion - np.eye(4)).max() < CONVERGED:
             break
     return T
 
 
-def refine_regions(
+def refine_region(
     demonstrated: Float[np.ndarray, "points 3"],
     points: Float[np.ndarray, "new_points 3"],
-    T_world_regions: Float[np.ndarray, "poses 4 4"],
+    T_world_region: Float[np.ndarray, "4 4"],
     radius: float,
 ) -> Float[np.ndarray, "poses 4 4"]:
-    """Refine poses of a region on a new cloud where its points fit those of the demonstration.
+    """Refine the pose of a region on a new cloud where its points fit those of the demonstration.
 
-    Each pose is registered from where it is. Where the two regions differ in size, as the rims of two mugs do, closest
-    points would tilt a pose and not fit better: then it stays. If the first pose does not fit, registrations from all
-    poses, shifted along their axes, are tried; one that fits far better replaces the first pose. Where the region of a
-    registered pose fits as well after a turn, as a peg does about its axis, the points around it decide.
+    It is registered from where it is and from places around it, in its orientation, and what fits best is taken if it
+    fits far better than the given pose. Where two regions differ in size, as the rims of two mugs do, nothing fits far
+    better: then the pose stays. Along a peg, other poses fit nearly as well, and they are returned too.
 
     The distance of two clouds of one region is about half of that between neighbouring points. On racks, clouds of less
-    than about 1000 points do not come below the limits, and the poses stay.
+    than about 1000 points do not come below the limits, and the pose stays.
 
     Args:
         demonstrated: cloud in the frame of the region, (points, 3), metres.
         points: the new cloud, (new_points, 3), metres, world frame.
-        T_world_regions: poses of the region on the new cloud, the best first, (poses, 4, 4).
+        T_world_region: pose of the region on the new cloud, 4x4.
         radius: half edge of the region, a cube about the origin of its frame, metres.
 
     Returns:
-        The poses, (poses, 4, 4).
+        Poses that fit, (poses, 4, 4): first the refined one, then those beside it along its axes that fit nearly as
+            well, the nearest first; the given one alone if none fits.
     """
-    given = np.asarray(T_world_regions, float)
-    before = np.array([region_distance(demonstrated, points, T, radius) for T in given])
-    refined = np.stack([register_region(demonstrated, points, T, radius) for T in given])
-    after = np.array([region_distance(demonstrated, points, T, radius) for T in refined])
-    fits = after < np.minimum(FITS_BETTER * before, FITS * radius)
-    if min(before[0], after[0]) >= FITS * radius:
-        other = _search(demonstrated, points, given, radius, FITS_MUCH_BETTER * before[0])
-        if other is not None:
-            refined[0], fits[0] = other, True
-    return np.stack(
-        [
-            _turned(demonstrated, points, pose, radius) if fit else start
-            for start, pose, fit in zip(given, refined, fits, strict=True)
-        ]
-    )
-
-
-def _search(demonstrated, points, given, radius: float, most: float) -> np.ndarray | None:
-    """The pose that fits best of those registered from the given ones, shifted; None if none fits well enough."""
-    steps = radius * np.concatenate([np.zeros((1, 3)), np.kron(np.eye(3), np.array(SHIFTS)[:, None])])
-    starts = np.repeat(given, len(steps), axis=0)
-    starts[:, :3, 3] += (given[:, None, :3, :3] @ steps[..., None])[..., 0].reshape(-1, 3)
-    nearest = np.argsort([region_distance(demonstrated, points, T, radius) for T in starts], kind="stable")[:SEARCHED]
+    given = np.asarray(T_world_region, float)
+    starts = np.repeat(given[None], len(SHIFTS) ** 3, axis=0)
+    starts[:, :3, 3] += radius * np.array(list(itertools.product(SHIFTS, repeat=3))) @ given[:3, :3].T
+    distances = np.array([region_distance(demonstrated, points, start, radius) for start in starts])
+    nearest = [start for start in np.argsort(distances, kind="stable")[:SEARCHED] if np.isfinite(distances[start])]
     found = [register_region(demonstrated, points, starts[start], radius) for start in nearest]
-    distances = [region_distance(demonstrated, points, T, radius) for T in found]
-    return found[int(np.argmin(distances))] if min(distances) < min(most, FITS_NEARLY * radius) else None
+    found = [pose for pose in found if _angle(given, pose) < MOST_TURN]
+    if not found:
+        return given[None]
+    after = np.array([region_distance(demonstrated, points, pose, radius) for pose in found])
+    moved = np.array([np.linalg.norm(pose[:3, 3] - given[:3, 3]) for pose in found]) / radius
+    before = region_distance(demonstrated, points, given, radius)
+    little = np.isfinite(before) & (after < min(FITS_A_LITTLE_BETTER * before, FITS_WELL * radius)) & (moved < NEARBY)
+    if not np.isfinite(before):
+        before = region_distance(demonstrated, points, given, SURROUNDINGS * radius)
+    # With nothing around it, the given pose is beside the object, and any place may be the right one.
+    near = (moved < NEAR) | (not np.isfinite(before))
+    fits = little | (near & (after < min(FITS_BETTER * before, FITS * radius)))
+    if not fits.any():
+        return given[None]
+    best = after[fits].min()
+    nearest = np.where(fits & (after <= AS_GOOD * best), moved, np.inf).argmin()
+    return _with_shifts(demonstrated, points, found[nearest], radius)
 
 
-def _turned(demonstrated, points, T: np.ndarray, radius: float) -> np.ndarray:
-    """Of a registered pose and those turned about its axes in which the region fits as well, what is around decides."""
-
-    def distance(pose, factor=1.0):
-        return region_distance(demonstrated, points, pose, factor * radius)
-
-    registered = [register_region(demonstrated, points, pose, radius) for pose in _turns(T, TURNS)]
-    as_good = [pose for pose in registered if distance(pose) <= AS_GOOD * distance(T)]
-    T = min([T, *as_good], key=lambda pose: distance(pose, SURROUNDINGS))
-    for _ in range(2):
-        as_good = [pose for pose in _turns(T, SMALL_TURNS) if distance(pose) <= AS_GOOD_UNMOVED * distance(T)]
-        T = min([T, *as_good], key=lambda pose: distance(pose, SURROUNDINGS))
-    return register_region(demonstrated, points, T, radius)  # what is around differs more than the region does
+def _with_shifts(demonstrated, points, pose: np.ndarray, radius: float) -> np.ndarray:
+    """A pose and those beside it along its axes that fit nearly as well, the nearest first."""
+    limit = NEARLY_AS_GOOD * region_distance(demonstrated, points, pose, radius)
+    poses = [pose]
+    for length, axis, sign in itertools.product(STEPS, range(3), (1, -1)):
+        beside = pose.copy()
+        beside[:3, 3] += sign * length * radius * pose[:3, axis]
+        if region_distance(demonstrated, points, beside, radius) <= limit:
+            poses.append(beside)
+    return np.stack(poses)
 
 
-def _turns(T: np.ndarray, angles) -> list[np.ndarray]:
-    """A pose turned about each of its axes by angles."""
-    from scipy.spatial.transform import Rotation
-
-    turned = np.tile(T, (3 * len(angles), 1, 1))
-    vectors = np.kron(np.eye(3), np.asarray(angles)[:, None])
-    turned[:, :3, :3] = T[:3, :3] @ Rotation.from_rotvec(vectors).as_matrix()
-    return list(turned)
+def _angle(one: np.ndarray, other: np.ndarray) -> float:
+    return float(np.arccos(np.clip((np.trace(one[:3, :3].T @ other[:3, :3]) - 1) / 2, -1, 1)))
 
 
 def region_distance(
@@ -175,10 +168,16 @@ def region_distance(
     return float(np.mean([distance.mean() for distance in distances]))
 
 
-def _motion(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """The rigid motion, 4x4, that brings points onto others with the least sum of squares."""
+def _motion(before: np.ndarray, after: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """The rigid motion, 4x4, that brings points onto others with the least mean square.
+
+    Args:
+        before: points, (points, 3).
+        after: where they are brought, (points, 3).
+        prior: inverse of a rotation that it should be near, 3x3, times its weight.
+    """
     from_, to = before.mean(axis=0), after.mean(axis=0)
-    left, _, right = np.linalg.svd((before - from_).T @ (after - to))
+    left, _, right = np.linalg.svd((before - from_).T @ (after - to) / len(before) + prior)
     sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(right.T @ left.T))])
     motion = np.eye(4)
     motion[:3, :3] = right.T @ sign @ left.T
