@@ -16,6 +16,7 @@ from tdf_jax.sim.execution import execute
 from tdf_jax.sim.grasping import MOST_SLIP, MOST_TURN, test_grasp
 from tdf_jax.sim.motion import Failure, plan_motion
 from tdf_jax.sim.physics import TIMESTEP, extra
+from tdf_jax.sim.posture import HALF_TURN
 from tdf_jax.sim.robot import Robot
 from tdf_jax.sim.tasks import TASKS, Episode
 from tdf_jax.sim.workcell import FIXTURE, OBJECT, TARGET, Workcell, build_workcell
@@ -387,7 +388,7 @@ def _pick_error(episode: Episode, pick) -> str:
     for turn in turns:
         T = np.eye(4)
         T[:3, :3] = Rotation.from_euler("z", turn).as_matrix()
-        for half in (np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0])):
+        for half in (np.eye(4), HALF_TURN):
             error = np.linalg.inv(T @ true @ half) @ local
             angle = float(np.degrees(Rotation.from_matrix(error[:3, :3]).magnitude()))
             best = min(best, (float(np.linalg.norm(error[:3, 3])) + angle / 1e3, angle))

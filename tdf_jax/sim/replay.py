@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 from numpy.typing import ArrayLike
 
 from tdf_jax._internal.errors import InputError
@@ -50,9 +50,11 @@ def replay_by_centroids(
         points: cloud of the object, (points, 3), metres, world frame.
         target_points: cloud of the target, (target_points, 3); None if it stands where it stood.
     """
-    ours = _centroid(points) - _centroid(demonstration.points)
-    theirs = np.zeros(3) if target_points is None else _centroid(target_points) - _centroid(_target(demonstration))
-    return _replayed(demonstration, _shift(ours), _shift(theirs))
+    ours, theirs = np.eye(4), np.eye(4)
+    ours[:3, 3] = np.mean(points, axis=0, dtype=float) - np.mean(demonstration.points, axis=0, dtype=float)
+    if target_points is not None:
+        theirs[:3, 3] = np.mean(target_points, axis=0, dtype=float) - _target(demonstration).mean(axis=0)
+    return _replayed(demonstration, ours, theirs)
 
 
 def replay_by_registration(
@@ -87,7 +89,7 @@ def replay_candidates(result: Result) -> Replay:
     Raises:
         InputError: no candidate is finite.
     """
-    return Replay([_matrices(poses) for poses in _finite(result)], _matrices(result.object_motion[None])[0])
+    return Replay([_matrices(Trajectory(jnp.asarray(poses))) for poses in _finite(result)], _motion(result))
 
 
 def blend_evenly(demonstration: Demonstration, result: Result) -> Replay:
@@ -103,7 +105,7 @@ def blend_evenly(demonstration: Demonstration, result: Result) -> Replay:
         InputError: no candidate is finite.
     """
     paths = [carry_trajectory(demonstration.transfer, poses[0], poses[-1]) for poses in _finite(result)]
-    return Replay([_matrices(path.wxyz_xyz) for path in paths], _matrices(result.object_motion[None])[0])
+    return Replay([_matrices(path) for path in paths], _motion(result))
 
 
 def describe_without_target(model: Model, demonstration: Demonstration) -> Reference:
@@ -151,10 +153,10 @@ def _finite(result: Result) -> list[Float[np.ndarray, "poses 7"]]:
 def _replayed(demonstration: Demonstration, ours: np.ndarray, theirs: np.ndarray) -> Replay:
     """The demonstrated path to ends that move with the object and the target, blended evenly between the two."""
     path = demonstration.transfer
-    pick = ours @ _matrices(path.wxyz_xyz[:1])[0]
-    motion = theirs @ _matrices(demonstration.object_motion[None])[0] @ np.linalg.inv(ours)
+    pick = ours @ _matrices(path)[0]
+    motion = theirs @ _motion(demonstration) @ np.linalg.inv(ours)
     ends = Trajectory.from_matrices(jnp.asarray(np.stack([pick, motion @ pick]))).wxyz_xyz
-    return Replay([_matrices(carry_trajectory(path, ends[0], ends[1]).wxyz_xyz)], motion)
+    return Replay([_matrices(carry_trajectory(path, ends[0], ends[1]))], motion)
 
 
 def _target(demonstration: Demonstration) -> Float[np.ndarray, "target_points 3"]:
@@ -165,15 +167,11 @@ def _target(demonstration: Demonstration) -> Float[np.ndarray, "target_points 3"
     return np.asarray(demonstration.target.points, float)
 
 
-def _centroid(points) -> Float[np.ndarray, "3"]:
-    return np.asarray(points, float).mean(axis=0)
+def _motion(of: Demonstration | Result) -> Float[np.ndarray, "4 4"]:
+    """The motion of the object, 4x4."""
+    return _matrices(Trajectory(jnp.asarray(of.object_motion)[None]))[0]
 
 
-def _shift(offset) -> Float[np.ndarray, "4 4"]:
-    T = np.eye(4)
-    T[:3, 3] = offset
-    return T
-
-
-def _matrices(wxyz_xyz: Float[Array | np.ndarray, "poses 7"]) -> Float[np.ndarray, "poses 4 4"]:
-    return np.asarray(Trajectory(jnp.asarray(wxyz_xyz)).matrices, float)
+def _matrices(path: Trajectory) -> Float[np.ndarray, "poses 4 4"]:
+    """Poses in double precision, as the physics has them."""
+    return np.asarray(path.matrices, float)

@@ -28,6 +28,7 @@ from tdf_jax.sim.bodies import Body, body_of
 from tdf_jax.sim.collision import Collisions
 from tdf_jax.sim.grasps import Grip, grip_of
 from tdf_jax.sim.kinematics import kinematics_of
+from tdf_jax.sim.posture import HALF_TURN
 from tdf_jax.sim.robot import Robot
 from tdf_jax.sim.scans import Scan
 from tdf_jax.sim.swing import level_rotations
@@ -259,8 +260,7 @@ def within_reach(episode: Episode, robot: Robot, collisions: Collisions) -> bool
         (episode.release, placed, {"object", "target"}),
     ):
         starts = [robot.home] + [robot.home + rng.uniform(-2.5, 2.5, robot.num_joints) for _ in range(SEARCHES)]
-        for start, half_turn in ((start, half_turn) for start in starts for half_turn in (1.0, -1.0)):
-            pose = T @ np.diag([half_turn, half_turn, 1.0, 1.0])
+        for start, pose in ((start, pose) for start in starts for pose in (T, T @ HALF_TURN)):
             joints = kinematics.solve(pose, np.clip(start, robot.lower, robot.upper))
             if joints is None or not free(joints, T_object, meet):
                 continue

@@ -1,7 +1,7 @@
 """Pictures of failed episodes: which are drawn, and that they show what failed."""
 
 import io
-import types
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,12 +23,16 @@ def run(number, cause, condition=SHELF, grasp=True):
     return Run(condition, number, outcome, 0, 0, (0.0, 0.0))
 
 
+def named(name="bowl", folder=Path()):
+    return Settings(SHELF, name, None, 0, folder)
+
+
 def test_the_first_of_each_cause_is_drawn():
     rows = [
-        ("first", [run(0, ""), run(1, "fell"), run(2, "not found"), run(3, "fell"), run(4, "not drawn")]),
-        ("second", [run(0, "fell"), run(1, "collided")]),
+        (named("first"), [run(0, ""), run(1, "fell"), run(2, "not found"), run(3, "fell"), run(4, "not drawn")]),
+        (named("second"), [run(0, "fell"), run(1, "collided")]),
     ]
-    found = [(name, one.number, one.outcome.cause) for name, one in first_failures(rows)]
+    found = [(settings.object_weights, one.number, one.outcome.cause) for settings, one in first_failures(rows)]
     assert found == [("first", 1, "fell"), ("second", 1, "collided")]
 
 
@@ -89,12 +93,11 @@ def test_without_a_renderer_one_line_says_so(monkeypatch, capsys, tmp_path):
 
     monkeypatch.setenv("MUJOCO_GL", "disable")
     monkeypatch.setattr(failures, "picture_failures", lambda failed: pytest.fail("it draws"))
-    settings = types.SimpleNamespace(condition=SHELF)
-    assert draw_failures("tdf simulate", [(settings, [run(0, "fell")])], tmp_path / "failures") is False
+    assert draw_failures("tdf simulate", [(named(), [run(0, "fell")])], tmp_path / "failures") is False
     out, error = capsys.readouterr()
     assert out == "" and len(error.splitlines()) == 1 and not (tmp_path / "failures").exists()
     assert error.startswith("tdf simulate: no pictures of failures: ") and "MUJOCO_GL is disable" in error
-    assert draw_failures("tdf simulate", [(settings, [run(0, "")])], tmp_path / "failures") is False
+    assert draw_failures("tdf simulate", [(named(), [run(0, "")])], tmp_path / "failures") is False
     assert capsys.readouterr() == ("", "")
 
 
@@ -103,8 +106,7 @@ def test_pictures_and_their_sheet_are_written(monkeypatch, tmp_path):
 
     monkeypatch.setattr(failures, "check_renderer", lambda: None)
     monkeypatch.setattr(failures, "picture_failures", lambda failed: [np.zeros((8, 8, 3), np.uint8) for _ in failed])
-    settings = types.SimpleNamespace(condition=SHELF)
-    rows = [(settings, [run(3, "fell"), run(5, "not settled")])]
+    rows = [(named(), [run(3, "fell"), run(5, "not settled")])]
     assert draw_failures("tdf simulate", rows, tmp_path / "failures") is True
     assert sorted(one.name for one in (tmp_path / "failures").iterdir()) == [
         "bowl_on_shelf-execute-known-upright-3-fell.png",

@@ -31,8 +31,9 @@ def test_rates_count_every_episode(runs):
     assert {name: rate for name, (rate, _) in table.items()} == {
         "grasp": 7 / 8, "place": 5 / 8, "overall": 5 / 8, "strict": 4 / 8,
     }  # fmt: skip
-    for rate, (low, high) in table.values():
-        assert 0 <= low < rate < high <= 1
+    for rate, interval in table.values():
+        assert rate is not None and interval is not None
+        assert 0 <= interval[0] < rate < interval[1] <= 1
 
 
 def test_causes_are_counted_the_most_frequent_first(runs):

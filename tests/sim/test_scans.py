@@ -57,7 +57,7 @@ def test_a_scan_is_held_as_the_generated_object(robot, scan, category):
     np.testing.assert_allclose(ours.T_object_grip[:3, :3], true.T_object_grip[:3, :3], atol=0.03)
     np.testing.assert_allclose(ours.T_object_grip[:3, 3], true.T_object_grip[:3, 3], atol=1e-3)
     assert ours.width == pytest.approx(true.width, abs=5e-4) and ours.fold == true.fold
-    points = np.random.default_rng(0).uniform(*shape.mesh.bounds, (400, 3))
+    points = np.random.default_rng(0).uniform(shape.mesh.bounds[0], shape.mesh.bounds[1], (400, 3))
     assert (one.contains(points) == shape.contains(points)).mean() > 0.99
     assert np.ptp(one.mesh.bounds, axis=0) == pytest.approx(np.ptp(shape.mesh.bounds, axis=0), abs=1e-4)
 
