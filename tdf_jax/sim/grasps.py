@@ -6,8 +6,10 @@ import numpy as np
 from jaxtyping import Float
 
 from tdf_jax._internal.errors import InputError
+from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.geometry.symmetry import ROUND
 from tdf_jax.shapes import Shape
+from tdf_jax.sim.pads import HALF_PAD, TIPS, flush_turn, turned_about_x
 from tdf_jax.sim.robot import Fingers
 
 CLEARANCE = 0.018  # metres between each finger and the wall before closing
@@ -17,8 +19,6 @@ MOST_DEPTH = 0.6  # of the height of a low bowl
 NECK_DEPTHS = (0.012, 0.052)  # metres from a bottle's top to the tips; the palm is 0.055 m behind them
 LEVEL_STEP = 0.001  # metres between levels at which a neck is measured
 TOUCHED = 0.0003  # metres: pads touch where the width is the largest between them, up to this
-TIPS = 0.0187  # metres from the middle of the pads to their tips
-HALF_PAD = 0.011  # metres, half the width of the pads
 # Metres from the tips within which pads slide off a slope, and beyond which the fingers of the 2F-85, which adapt to
 # what they enclose, give way; and the share that a grasp is worth there.
 EDGE, UNSTEADY, AT_EDGE = 0.005, 0.009, 0.3
@@ -32,6 +32,7 @@ DIRECTIONS, ROUND_TOLERANCE = (
 # Where a wall's middle is measured below the rim, metres: the gripper lies along the line through both.
 WALL_LEVELS = (0.004, 0.025)
 WALL_SEARCH = np.linspace(-0.07, 0.025, 951)  # metres along the outward direction
+SURFACE = 200_000  # points of the surface, of which some hundreds are between the pads
 
 
 class Grip(NamedTuple):
@@ -54,8 +55,8 @@ class Grip(NamedTuple):
 def grip_of(shape: Shape, fingers: Fingers) -> Grip:
     """The demonstrated grasp of a generated object: a mug or a bowl at the wall of the rim, a bottle at the neck.
 
-    A mug is held opposite to its handle, which is then free for a peg. The gripper lies along the wall, closes across
-    it, and its pads are as deep as the tips allow.
+    A mug is held opposite to its handle, which is then free for a peg. The gripper closes across the wall, turned so
+    that the pads lie flush with it.
 
     Args:
         shape: the object.
@@ -85,8 +86,13 @@ def _rim_grip(shape: Shape, fingers: Fingers) -> Grip:
     T[:3, :3] = np.stack([np.cross(across, down), across, down], axis=1)
     width = max(width, lower_width)
     top = upper - down * (levels[0] / max(float(-down @ up), 0.5))
-    T[:3, 3] = top + down * (depth - TIPS - fingers.depth(width))
-    return Grip(T, width, min(width + 2 * CLEARANCE, fingers.widest))
+    tip = fingers.tip(width)
+    T[:3, 3] = top + down * (depth - tip)
+    opening = min(width + 2 * CLEARANCE, fingers.widest)
+    points = (sample_surface(shape.mesh, SURFACE, np.random.default_rng(0)) - T[:3, 3]) @ T[:3, :3]
+    pivot = tip - depth / 2
+    angle, shift = flush_turn(points[np.abs(points[:, 1]) < opening / 2], tip, pivot)
+    return Grip(turned_about_x(T, angle, pivot, shift), width, opening)
 
 
 def _wall(shape: Shape, rim, level: float) -> tuple[np.ndarray, float]:

@@ -29,7 +29,7 @@ MAX_ACCELERATION = 3.0  # rad/s^2
 COMMANDS, SETTLE = 12, 0.8
 CLOSED = 0.015  # metres, gap at the last command but one from which the fingers close
 HEIGHTS = np.linspace(-0.05, 0.05, 101)  # metres from the site
-LEVEL = 0.001  # metres by which the gap between the pads may differ from that of their tips
+LEVEL = 0.0005  # metres by which the gap may differ from one height to the next on pads, which may lean a little
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -338,6 +338,6 @@ def _gap(mujoco, model, data, site: str) -> tuple[float, float, float]:
     if not len(between):
         return np.nan, np.nan, np.nan
     tip = int(between[0])
-    other = np.flatnonzero(~(np.abs(np.array(gaps[tip:]) - gaps[tip]) <= LEVEL))
-    pads = slice(tip, tip + int(other[0]) if len(other) else None)
+    steps = np.flatnonzero(~(np.abs(np.diff(gaps[tip:])) <= LEVEL))  # where the pads end
+    pads = slice(tip, tip + int(steps[0]) + 1 if len(steps) else None)
     return float(np.mean(gaps[pads])), float(HEIGHTS[::-1][pads].mean()), float(HEIGHTS[::-1][tip])

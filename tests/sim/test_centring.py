@@ -10,14 +10,15 @@ from tdf_jax.sim.centring import centred
 from tdf_jax.sim.grasps import grip_of
 
 
-@pytest.fixture(scope="module", params=[("mug", 0), ("mug", 1), ("bottle", 2)], ids=lambda one: f"{one[0]}{one[1]}")
+@pytest.fixture(
+    scope="module", params=[("mug", 0), ("mug", 1), ("bowl", 2), ("bottle", 2)], ids=lambda one: f"{one[0]}{one[1]}"
+)
 def held(request, robot):
     category, seed = request.param
     family = FAMILIES[category]
     shape = family.build(family.sample(np.random.default_rng(seed)))
     cloud = sample_surface(shape.mesh, 1500, np.random.default_rng(3))
-    # A neck narrows, ends in a shoulder and is seen by few points: its line is known to ten degrees.
-    return cloud, grip_of(shape, robot.fingers), (10, 3e-3) if category == "bottle" else (3, 1.5e-3)
+    return cloud, grip_of(shape, robot.fingers), {"mug": (2, 1e-3), "bowl": (3, 1e-3), "bottle": (2, 0.5e-3)}[category]
 
 
 def moved_grip(T, degrees, shift, fingers):

@@ -5,6 +5,7 @@ import pytest
 
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
+from tdf_jax.sim.workcell import build_workcell
 
 mujoco = pytest.importorskip("mujoco", reason="the extra 'sim' is not installed")
 
@@ -64,8 +65,19 @@ def test_the_gripper_of_the_ur5e_is_measured(robot):
     fingers = robot.fingers
     assert fingers.widest == pytest.approx(0.085, abs=0.001)  # the 85 in its name, millimetres
     assert (np.diff(fingers.openings) < 0).all() and fingers.openings[-1] == 0
-    # The pads move forward along the approach as they close, by about 2 cm from the widest opening.
-    assert fingers.depths[-1] - fingers.depths[0] == pytest.approx(0.022, abs=0.005)
+    # The pads move forward along the approach as they close, by 1.3 cm from the widest opening. Rays find their middle
+    # and their tips where the boxes of the model are.
+    cell = build_workcell(robot, floating=True)
+    data = cell.data()
+    pads = [number for number in range(cell.model.ngeom) if "pad" in cell.model.geom(number).name]
+    assert len(pads) == 4
+    for opening, depth, tip in zip(fingers.openings, fingers.depths, fingers.tips):
+        cell.open_fingers(data, opening)
+        mujoco.mj_forward(cell.model, data)
+        frame = cell.gripper_pose(data)
+        heights = (data.geom_xpos[pads] - frame[:3, 3]) @ frame[:3, 2]
+        assert depth == pytest.approx(heights.mean(), abs=0.001)
+        assert tip == pytest.approx(heights.max() + cell.model.geom_size[pads[0], 2], abs=0.0015)
     for opening in (0.0, 0.02, 0.05, fingers.widest):
         command = fingers.command(opening)
         assert np.interp(command, fingers.commands, fingers.openings) == pytest.approx(opening, abs=1e-9)
@@ -75,8 +87,6 @@ def test_the_gripper_of_the_ur5e_is_measured(robot):
 def test_the_ur5e_is_an_arm_of_six_joints_with_a_home_that_points_down(robot):
     assert robot.num_joints == 6 and all("shoulder" in name for name in robot.joints[:2])
     assert (robot.lower < robot.home).all() and (robot.home < robot.upper).all()
-    from tdf_jax.sim.workcell import build_workcell
-
     cell = build_workcell(robot)
     T = cell.gripper_pose(cell.data())
     np.testing.assert_allclose(T[:3, 2], (0, 0, -1), atol=1e-3)
