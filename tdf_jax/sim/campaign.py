@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from tdf_jax.sim.robot import Robot
     from tdf_jax.sim.scans import Scan
 
-FORMAT = 6  # format number; raise it when what an episode computes changes
+FORMAT = 7  # format number; raise it when what an episode computes changes
 DEMONSTRATIONS = 10  # episodes that demonstrate; with one demonstration, each is that of a tenth of the episodes
 FIRST_DEMONSTRATION = 1_000_000  # their numbers begin here, so that no episode shares their objects
 MOST_PROCESSES = 1024  # more are a mistake
