@@ -21,6 +21,7 @@ MOST_TURN = np.radians(35)  # from the given orientation
 # to 1 but for one that had moved by 65 mm.
 FITS_BETTER, FITS, NEAR = 0.6, 0.22, 1.6
 FITS_A_LITTLE_BETTER, FITS_WELL, NEARBY = 0.75, 0.12, 0.65
+FITS_FAR_BETTER, FITS_ROUGHLY = 0.4, 0.3  # a short peg, whose post is in the region, fits no better than roughly
 # Factors on the least distance: up to the first, the nearest place is taken; up to the second, others beside it are
 # returned too, these shares of the half edge away.
 AS_GOOD, NEARLY_AS_GOOD = 1.1, 1.6
@@ -116,7 +117,8 @@ def refine_region(
         before = region_distance(demonstrated, points, given, SURROUNDINGS * radius)
     # With nothing around it, the given pose is beside the object, and any place may be the right one.
     near = (moved < NEAR) | (not np.isfinite(before))
-    fits = little | (near & (after < min(FITS_BETTER * before, FITS * radius)))
+    limits = min(FITS_BETTER * before, FITS * radius), min(FITS_FAR_BETTER * before, FITS_ROUGHLY * radius)
+    fits = little | (near & (after < max(limits)))
     if not fits.any():
         return given[None]
     best = after[fits].min()

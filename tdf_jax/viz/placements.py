@@ -1,5 +1,6 @@
 """Placed objects, cut open: where an object was put on its target, above where it belongs."""
 
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 VIEW = {"elev": 12.0, "azim": -75.0}  # of the viewer, degrees: a little aside of the cut
 PIECE = 0.04  # longest edge of a drawn triangle, share of half a panel's edge, because long ones occlude wrongly
 COLUMN, ROW = 1.5, 1.5  # inches
+TITLE = 22  # characters of a line of a panel's title
 AROUND = 1.25  # edge of a panel, in that of the object; what is farther from it is cut away
 OBJECT_COLOUR = np.array(COLOURS(0.62)[:3])
 
@@ -62,7 +64,8 @@ def placements_figure(placements: Sequence[PlacedMeshes]) -> Figure:
                 set_view(axes, (1, 1, 1), 1.75, VIEW)
                 axes.set_axis_off()
                 if row == 0:
-                    axes.set_title(one.title, y=0.98, fontsize=6)
+                    lines = [textwrap.fill(line, TITLE) for line in one.title.splitlines()]
+                    axes.set_title("\n".join(lines), y=0.98, fontsize=6)
         figure.text(0.005, 0.72, "found", rotation=90, va="center", fontsize=7)
         figure.text(0.005, 0.26, "right", rotation=90, va="center", fontsize=7)
         figure.subplots_adjust(left=0.02, right=1, bottom=0.01, top=0.87, wspace=0, hspace=0)

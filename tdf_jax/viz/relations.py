@@ -1,6 +1,7 @@
 """An object that is placed on a target: the demonstration and its imitation, as in figure 4 of the paper."""
 
 import dataclasses
+import textwrap
 from typing import Any
 
 import jax.numpy as jnp
@@ -24,6 +25,7 @@ from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, STYLE, TRUTH, ad
 
 BEFORE, AFTER, TARGET, CONTACT = COLOURS(0.0), COLOURS(0.62), CLOUD, TRUTH
 HEIGHT = 7.2  # inches
+TITLE = 95  # characters of a line of the title
 SIZE = 2.4  # of a square point, typographic points squared
 MARGIN = 1.08  # length of the axes, in that of their contents
 ZOOM = 1.03, 0.93  # of the overviews, whose long boxes leave room, and of the close-ups
@@ -104,7 +106,7 @@ def relation_figure(
         _row(figure, sides, (0.54, 0.395), box)
         _row(figure, close, (0.12, 0.355), None)
         _legend(figure)
-        figure.suptitle(title, y=0.985)
+        figure.suptitle(textwrap.fill(title, TITLE), y=0.995)
     return figure
 
 

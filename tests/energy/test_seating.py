@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tdf_jax.energy.seating import REACH, touch_distance
+from tdf_jax.energy.seating import REACH, overlap, touch_distance
 
 RADIUS = 0.04
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -74,3 +74,11 @@ def test_a_shadow_in_the_field_of_the_target_is_not_touched():
     shadow = solid(lambda x: jnp.where(x[..., 2] < 0, 1.0, jnp.where(x[..., 2] < 0.006, 2e-4, -1.0)))
     assert np.asarray(shadow.occupancy(jnp.array([0, 0, 0.003]))) == pytest.approx(0.6, abs=0.01)
     assert abs(touch_distance(BALL, shadow, sphere(), floor(), raised(0.004), DOWN) - 0.004) < 1e-3
+
+
+def test_points_in_the_object_are_counted_where_no_height_frees_it():
+    wall = np.stack([np.zeros(50), np.zeros(50), np.linspace(-0.1, 0.1, 50)], axis=1)  # through the ball, all along
+    assert overlap(BALL, wall, np.eye(4), DOWN) > 5
+    assert overlap(BALL, wall + [2 * RADIUS, 0.0, 0.0], np.eye(4), DOWN) == 0
+    below = np.stack([np.zeros(50), np.zeros(50), np.full(50, -RADIUS + 0.004)], axis=1)  # free once it is raised
+    assert overlap(BALL, below, np.eye(4), DOWN) == 0

@@ -1,5 +1,7 @@
 """Robots: the calibration of a gripper, files of other robots, and what is refused."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -149,7 +151,7 @@ def test_fingers_that_do_not_close_are_refused(arm):
 
 
 def test_wrong_arguments_are_refused(arm, tmp_path):
-    for message, arguments, options in (
+    calls: tuple[tuple[str, tuple[Any, ...], dict[str, Any]], ...] = (
         ("there is no file .*missing.xml; expected an MJCF", (tmp_path / "missing.xml", "grip"), {}),
         ("has no site 'pinch'; it has still, grip", (arm(), "pinch"), {}),
         ("the site 'still' of .* is not carried by an arm", (arm(), "still"), {}),
@@ -161,7 +163,8 @@ def test_wrong_arguments_are_refused(arm, tmp_path):
         ("home is .*3.* outside of .* limits", (arm(), "grip"), {"home": (0, 3, 0)}),
         ("max_velocity is 0", (arm(), "grip"), {"max_velocity": 0}),
         ("max_acceleration is -1", (arm(), "grip"), {"max_acceleration": -1}),
-    ):
+    )
+    for message, arguments, options in calls:
         with pytest.raises(InputError, match=rf"load_robot\(\): .*{message}"):
             tdf.load_robot(*arguments, **options)
 
