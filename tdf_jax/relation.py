@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import host
@@ -47,9 +47,6 @@ MAX_TOUCH_DISTANCE = 0.01
 # Half edge of the region that is registered, a factor on the spread of the contact points along an axis: of points in a
 # box, 0.6 of half its edge. A larger one reaches from the middle of a short peg to its post.
 REGION = 1.05
-AS_FREE = (
-    0  # points of the target that may be in the object: with a displacement that frees it, those of the contact are not
-)
 REGISTERED = 4000  # most points of a cloud that are registered; more would cost up to minutes
 MAX_SOLUTIONS = 25  # candidates of a result: distinct picks times distinct motions of the object
 
@@ -75,7 +72,7 @@ class Objects:
 
 @dataclasses.dataclass(frozen=True)
 class Relations:
-    """Distinct motions of an object to a target, the best first: those that touch it, by their energies, then others.
+    """Distinct motions of an object to a target, the best first.
 
     Attributes:
         target_contacts: poses X_t of the contact frame on the target, world frame, (solutions, 7).
@@ -92,12 +89,6 @@ class Relations:
     energies: Float[np.ndarray, " solutions"]
     seatings: Float[np.ndarray, "solutions 3"]
     target_residual: float
-
-    @property
-    def untouched(self) -> Bool[np.ndarray, " solutions"]:
-        """Whether a motion does not bring the object to its target although others do."""
-        missed = np.isnan(self.seatings).any(axis=1)
-        return np.asarray(missed & ~missed.all())
 
     @property
     def motions(self) -> Float[Array, "solutions 7"]:
@@ -250,7 +241,8 @@ def find_relations(
         seat: see `relate`.
 
     Returns:
-        Every pair of a distinct pose on the target and one on the object, by the sum of their energies.
+        Pairs of a distinct pose on the target and one on the object, by the sum of their energies; of those that are
+            seated, the ones that touch.
 
     Raises:
         InputError: the demonstration has no target, or nothing finite was found.
@@ -334,9 +326,9 @@ def _registered(
         for T in refined:
             down = (T @ back)[:3, :3] @ np.asarray(contact.down, float)
             inside = overlap(objects.field, points, T @ back @ T_contact_world, down)
-            if inside < least - AS_FREE:
+            if inside < least:
                 free, least = T, inside
-            if least <= AS_FREE:
+            if least == 0:
                 break
         T = free @ back
         poses.append(np.asarray(se3.pose(T[:3, :3], T[:3, 3])))
@@ -348,7 +340,11 @@ def _matrix(pose) -> Float[np.ndarray, "4 4"]:
 
 
 def _seated(objects: Objects, found: Relations, contact: Contact) -> Relations:
-    """The relations with displacements of the placed object until it touches the target, those that touch first."""
+    """The relations with displacements of the placed object until it touches the target; only those that touch it.
+
+    One that does not touch its target anywhere near, or cannot come free of it, is not what was demonstrated. If none
+    touches, all are kept.
+    """
     if not abs(float(contact.touch)) <= MAX_TOUCH_DISTANCE:  # also where it is not known
         return found
     target_points = contact.target_points if objects.target_points is None else objects.target_points
@@ -360,15 +356,13 @@ def _seated(objects: Objects, found: Relations, contact: Contact) -> Relations:
             for motion, direction in zip(found.motions, directions, strict=True)
         ]
     )
-    # One that does not touch its target anywhere near, or cannot come free of it, is not what was demonstrated.
-    order = np.argsort(np.isnan(distances), kind="stable")
-    seatings = (distances[:, None] * directions).astype(np.float32)
+    kept = np.isfinite(distances) | np.isnan(distances).all()
     return dataclasses.replace(
         found,
-        target_contacts=found.target_contacts[order],
-        object_contacts=found.object_contacts[order],
-        energies=found.energies[order],
-        seatings=seatings[order],
+        target_contacts=found.target_contacts[kept],
+        object_contacts=found.object_contacts[kept],
+        energies=found.energies[kept],
+        seatings=(distances[:, None] * directions).astype(np.float32)[kept],
     )
 
 
@@ -447,9 +441,7 @@ def carry_object(
     distinct = np.array([mode.members[0] for mode in modes]) if modes else np.arange(len(picks))
     pick_energies = np.where(np.asarray(picked.finite), np.asarray(picked.energies), np.inf)[distinct]
     joint = pick_energies[:, None] + relations.energies
-    # First the motions that touch the target, as in `relations`; each pick goes with every motion.
-    untouched = np.broadcast_to(relations.untouched, joint.shape)
-    order = np.lexsort((joint.ravel(), untouched.ravel()))[:MAX_SOLUTIONS]
+    order = np.argsort(joint, axis=None, kind="stable")[:MAX_SOLUTIONS]
     rows, columns = np.unravel_index(order, joint.shape)
     energies, rows = joint[rows, columns], distinct[rows]
     contact, points = reference.contact, np.asarray(objects.points, float)

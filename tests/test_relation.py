@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+from types import SimpleNamespace
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +12,7 @@ import pytest
 from conftest import QUERIES, carried, composed, random_cloud, random_poses
 
 import tdf_jax as tdf
+from tdf_jax import relation
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.relation_success import judge
 from tdf_jax.evaluation.relation_tasks import demonstrate, draw_pair, place_pair
@@ -123,6 +126,22 @@ def test_a_network_of_a_target_that_stands_where_it_stood_seats_the_object(small
     assert seen[0] is None
     there = tdf.encode(small_model, related.target.points)
     np.testing.assert_allclose(seen[-1].latent, there.latent, atol=1e-6)
+
+
+@pytest.mark.parametrize(("distances", "kept"), [((np.nan, 0.004, np.nan, -0.002), [1, 3]), ((np.nan,) * 4, range(4))])
+def test_motions_that_do_not_touch_the_target_are_left_out_where_others_do(monkeypatch, distances, kept):
+    poses = np.tile(np.float32([1, 0, 0, 0, 0, 0, 0]), (4, 1))
+    poses[:, 4] = range(4)
+    found = relation.Relations(poses, poses, np.arange(4.0), np.full((4, 3), np.nan, np.float32), 0.1)
+    contact = cast(Any, SimpleNamespace(touch=0.0, target_points=np.zeros((1, 3)), down=jnp.array([0.0, 0.0, -1.0])))
+    objects = relation.Objects(np.zeros((1, 3)), None, cast(Any, None), None)
+    left = iter(distances)
+    monkeypatch.setattr(relation, "touch_distance", lambda *_: next(left))
+    seated = relation._seated(objects, found, contact)
+    np.testing.assert_array_equal(seated.energies, np.arange(4.0)[list(kept)])
+    np.testing.assert_array_equal(seated.target_contacts, poses[list(kept)])
+    np.testing.assert_array_equal(seated.object_contacts, poses[list(kept)])
+    np.testing.assert_allclose(seated.seatings[:, 2], -np.array(distances)[list(kept)])
 
 
 def test_a_target_of_another_category_is_warned_of(small_model, related, moved, monkeypatch):

@@ -53,8 +53,8 @@ def touch_distance(
         direction: unit vector along which the object is moved, such as down, (3,), world frame.
 
     Returns:
-        The displacement, metres: positive along the direction if there is a gap, negative if the two overlap; NaN if
-            they do not touch, or overlap still, within `REACH`.
+        The displacement, metres: positive along the direction if there is a gap, negative if the two overlap, `MARGIN`
+            short of where the tested points touch; NaN if they do not touch, or overlap still, within `REACH`.
     """
     # In NumPy but for the fields: the number of points differs from call to call, and JAX would compile for each.
     R, t = np.asarray(se3.rotation(jnp.asarray(motion)), float), np.asarray(motion, float)[4:]
@@ -78,7 +78,7 @@ def overlap(
     motion: Float[np.ndarray, "4 4"],
     direction: Float[Array | np.ndarray, "3"],
 ) -> int:
-    """How many points of a target are in or close to a placed object, wherever it is raised or lowered to.
+    """How many points of a target are in or close to a placed object, at the best of five heights.
 
     Args:
         field: field of the object in its initial pose.
@@ -87,7 +87,7 @@ def overlap(
         direction: unit vector along which the object may be moved, (3,), world frame.
 
     Returns:
-        The least number of points, of at most `CLOUD`, at displacements of up to `REACH`.
+        The least number of points, of at most `CLOUD`, at displacements of up to 0.7 times `REACH` each way.
     """
     x = subset(np.asarray(target_points, float), CLOUD)
     shifts = np.array(OVERLAP_STEPS)[:, None, None] * REACH * np.asarray(direction, float)
