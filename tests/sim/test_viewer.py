@@ -150,7 +150,7 @@ def test_a_kept_episode_runs_again_to_be_shown(windows, clock, tmp_path, monkeyp
     def bench(settings):
         made = object.__new__(campaign._Bench)
         made.settings, made.condition = settings, settings.condition
-        made.fingerprints, made.robot_content, made.robot = [], [], None
+        made.fingerprints, made.robot_content, made.robot, made.scans = [], [], None, []
         return made
 
     monkeypatch.setattr("tdf_jax.sim.episode.run_episode", run_episode)
@@ -174,7 +174,7 @@ def test_the_first_episode_alone_is_shown(tmp_path, monkeypatch):
             asked.append((number, view))
             return types.SimpleNamespace(result=lambda: number, cancel=lambda: None)
 
-    monkeypatch.setattr(campaign, "_pool", lambda count: contextlib.nullcontext(Pool()))
+    monkeypatch.setattr(campaign, "process_pool", lambda count: contextlib.nullcontext(Pool()))
     condition = campaign.Condition("bowl_on_shelf", "known", "upright", "execute")
     settings = campaign.Settings(condition, "bowl", None, 0, tmp_path)
     assert list(campaign.run_campaign(settings, 3, 1, progress=False, view=True)) == [0, 1, 2]
