@@ -137,6 +137,8 @@ def test_the_record_tells_all_settings(folder, weights):
         "goal_offset": [0.0, 0.0, 0.0], "k": None, "method": "adam", "num_starts": 3, "num_poses": 4, "queries": 8,
         "iterations": 3, "points": 60,
         "seed": 0, "weights": str(weights), "out": str(folder), "no_plots": False, "json": False,
+        "depth": None, "intrinsics": None, "camera_pose": None, "mask": None, "workspace": None, "depth_scale": None,
+        "clusters": False,
     }  # fmt: skip
     assert record["energy"] == dataclasses.asdict(tdf.EnergyWeights(0.02))
     assert record["optimiser"] == dataclasses.asdict(tdf.OptimizeConfig(num_starts=3, iterations=3))
