@@ -42,7 +42,7 @@ BEFORE = 5  # first poses that are left out: the object is still where it lay
 def touches(
     task: str, object_model: Model, target_model: Model | None, clouds: str, pairs: int, seed: int = SEED
 ) -> Float[np.ndarray, " pairs"]:
-    """How far down true placements touch by occupancies, metres; 0 would be exact, but for the margin of `touch_distance`.
+    """How far down true placements touch by occupancies, metres; with the margin of `touch_distance`, -6e-4 is exact.
 
     Args:
         task: name of the task.
