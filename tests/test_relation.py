@@ -144,6 +144,38 @@ def test_motions_that_do_not_touch_the_target_are_left_out_where_others_do(monke
     np.testing.assert_allclose(seated.seatings[:, 2], -np.array(distances)[list(kept)])
 
 
+def test_along_a_rod_the_nearest_place_is_taken_where_the_object_is_free_of_the_post():
+    rng = np.random.default_rng(0)
+
+    def rod():
+        angle, along = rng.uniform(0, 2 * np.pi, 900), rng.uniform(-0.1, 0.1, 900)
+        return np.stack([along, 0.005 * np.cos(angle), 0.005 * np.sin(angle)], axis=1)
+
+    post = np.stack([np.full(60, -0.05), np.zeros(60), np.linspace(-0.1, 0.1, 60)], axis=1)
+    contact = cast(
+        Any,
+        SimpleNamespace(
+            query=rng.uniform(-0.03, 0.03, (200, 3)),
+            T_world_contact=np.array([1.0, 0, 0, 0, 0, 0, 0]),
+            target_points=rod(),
+            down=np.array([0.0, 0.0, -1.0]),
+        ),
+    )
+    found = {}
+    for name, centre in {"in the post": -0.04, "free": 0.04}.items():
+
+        def occupancy(x, centre=centre):  # of a ball beside the contact
+            return jax.nn.sigmoid(2000 * (0.02 - jnp.linalg.norm(x - jnp.array([centre, 0.0, -0.03]), axis=-1)))
+
+        points = np.concatenate([rod(), post])
+        objects = relation.Objects(points, points, cast(Any, SimpleNamespace(occupancy=occupancy)), None)
+        above = np.float32([[1, 0, 0, 0, 0, 0, 0.012]])
+        found[name] = relation._registered(above, np.float32([1, 0, 0, 0, 0, 0, 0]), objects, contact)[0]
+    assert np.abs(found["free"][4:]).max() < 0.004  # on the rod's axis, where it was along it
+    moved = found["in the post"][4:] - found["free"][4:]
+    assert 0.009 < moved[0] < 0.02 and np.abs(moved[1:]).max() < 0.004
+
+
 def test_a_target_of_another_category_is_warned_of(small_model, related, moved, monkeypatch):
     reference = tdf.describe(small_model, related, target_model=small_model)
     options = {"points": moved[0], "target_points": moved[1], "key": KEY, "config": SEARCH}

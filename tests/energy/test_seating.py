@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tdf_jax.energy.seating import REACH, overlap, touch_distance
+from tdf_jax.energy.seating import MARGIN, REACH, overlap, touch_distance
 
 RADIUS = 0.04
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -41,6 +41,11 @@ def raised(height, motion=(1.0, 0, 0, 0, 0, 0, 0)):
 def test_a_ball_is_lowered_or_raised_onto_the_floor(height, target):
     found = touch_distance(BALL, target, sphere(), floor(), raised(height), DOWN)
     assert abs(found - height) < 1e-3
+
+
+def test_the_ball_stays_a_margin_above_the_floor():
+    left = [height - touch_distance(BALL, FLOOR, sphere(), floor(), raised(height), DOWN) for height in (0.007, 0.002)]
+    assert np.abs(np.array(left) - MARGIN).max() < MARGIN / 2
 
 
 def test_the_touch_turns_with_the_scene():
