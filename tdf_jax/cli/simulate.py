@@ -78,8 +78,9 @@ def simulate(
     from tdf_jax.cli.episodes import FAILURES, SHEET, draw_failures
     from tdf_jax.evaluation.records import write_record
     from tdf_jax.networks.checkpoint import load_model
-    from tdf_jax.sim import campaign
-    from tdf_jax.sim.campaign import Condition, Settings, check_condition, check_counts, check_settings, film
+    from tdf_jax.sim.campaign import check_counts, film, run_campaign
+    from tdf_jax.sim.condition import GENERATED, MESHES, Condition, Settings, check_condition, check_settings
+    from tdf_jax.sim.imitator import load_objects
     from tdf_jax.sim.physics import LIGHT_MASS, extra
     from tdf_jax.sim.recording import ENDINGS, check_film
     from tdf_jax.sim.report import not_drawn, record, summary
@@ -104,7 +105,7 @@ def simulate(
         check_film(video)
     if view:
         check_display()
-    objects = campaign.GENERATED if meshes is None else campaign.MESHES
+    objects = GENERATED if meshes is None else MESHES
     condition = Condition(
         task, target, pose, mode, clouds, demonstrations, method, LIGHT_MASS if light else 0.0, objects
     )
@@ -121,13 +122,13 @@ def simulate(
     for weights in (settings.object_weights, target_weights):
         if weights is not None:
             load_model(weights)
-    campaign.load_objects(settings)
+    load_objects(settings)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"tdf simulate: cannot make the folder {out} ({error}); expected a writable place") from None
     settings = dataclasses.replace(settings, folder=out.resolve(), meshes=None if meshes is None else meshes.resolve())
-    runs = list(campaign.run_campaign(settings, episodes, processes, view=view))
+    runs = list(run_campaign(settings, episodes, processes, view=view))
     print(summary(runs))
     if json is not None:
         write_record("tdf simulate", json, record(settings, runs))

@@ -26,6 +26,8 @@ Modules:
     tasks: what is picked, where it goes, and where objects start
     replay: baselines: the demonstrated path by other means, and the paper's energy
     episode: one task from the start to the settled end
+    condition: what a row of episodes is measured under, and what its episodes share
+    imitator: what is imitated in the episodes of a campaign
     campaign: many episodes in several processes
     report: success, causes of failure, and the record of a run
     published: published success rates, and which rows stand beside them

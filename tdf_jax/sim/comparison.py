@@ -14,7 +14,8 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.statistics import bootstrap_interval
 from tdf_jax.evaluation.tables import between, markdown, percent
 from tdf_jax.sim import report
-from tdf_jax.sim.campaign import DEMONSTRATIONS, GENERATED, LIBRARY, MESHES, TRUTH, Condition, Run, Settings
+from tdf_jax.sim.campaign import Run
+from tdf_jax.sim.condition import DEMONSTRATIONS, GENERATED, LIBRARY, MESHES, TRUTH, Condition, Settings
 from tdf_jax.sim.episode import CRITERIA
 from tdf_jax.sim.physics import LIGHT_MASS
 from tdf_jax.sim.published import PAPERS, Published, peers_of
@@ -124,10 +125,10 @@ def planned_rows(
         targets: "known" and "found"; None for those of the published protocols, `TARGETS`.
         poses: how objects start.
         clouds: "full", or what three cameras or one see.
-        methods: names of `tdf_jax.sim.campaign.METHODS`.
+        methods: names of `tdf_jax.sim.condition.METHODS`.
         demonstrations: numbers of demonstrations, 1 and 10.
         light: whether teleported objects have the mass of those in NDF and R-NDF; executed ones never do.
-        objects: names of `tdf_jax.sim.campaign.OBJECTS`.
+        objects: names of `tdf_jax.sim.condition.OBJECTS`.
 
     Raises:
         InputError: an argument is empty, or one of its values is in no combination.

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from tdf_jax.sim.campaign import Run, Settings, found_in, process_pool
+from tdf_jax.sim.campaign import Run, found_in, process_pool
+from tdf_jax.sim.condition import Settings
 from tdf_jax.sim.episode import NOT_FOUND, reset_cell, run_episode, settle
 from tdf_jax.sim.grasping import CLOSE, LIFT, LIFTED, FloatingHand
 from tdf_jax.sim.recording import Recorder, gl_context

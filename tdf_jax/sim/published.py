@@ -6,7 +6,7 @@ The protocols are those of `tdf_jax.sim.episode.teleport`; the objects are other
 from typing import NamedTuple
 
 from tdf_jax.evaluation.relation_report import PUBLISHED as R_NDF, PUBLISHED_ONE as R_NDF_ONE
-from tdf_jax.sim.campaign import Condition
+from tdf_jax.sim.condition import Condition
 
 PAPERS = {
     "NDF": "[NDF](https://arxiv.org/abs/2112.05124) (Simeonov et al., ICRA 2022)",

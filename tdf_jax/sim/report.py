@@ -12,7 +12,8 @@ from jaxtyping import Float
 
 from tdf_jax.evaluation.statistics import bootstrap_interval
 from tdf_jax.evaluation.tables import percent
-from tdf_jax.sim.campaign import Condition, Run, Settings
+from tdf_jax.sim.campaign import Run
+from tdf_jax.sim.condition import Condition, Settings
 from tdf_jax.sim.episode import CRITERIA
 from tdf_jax.sim.tasks import TASKS
 

@@ -11,8 +11,10 @@ from PIL import Image
 from tdf_jax._internal.errors import InputError
 from tdf_jax.sim import campaign
 from tdf_jax.sim.bodies import Body
-from tdf_jax.sim.campaign import TRUTH, Condition, Settings, centred_path, check_condition, run_campaign, run_one
+from tdf_jax.sim.campaign import run_campaign, run_one
+from tdf_jax.sim.condition import LIBRARY, METHODS, REPLAY, TRUTH, Condition, Settings, check_condition, check_settings
 from tdf_jax.sim.episode import Outcome
+from tdf_jax.sim.imitator import Imitator, centred_path
 from tdf_jax.sim.recording import check_film
 from tdf_jax.sim.report import record
 from tdf_jax.sim.tasks import NotDrawn
@@ -66,13 +68,13 @@ def test_a_film_is_of_the_same_episode(first, tmp_path):
 def test_a_run_is_resumed(first, monkeypatch):
     """What is kept is not run again, and what is missing is."""
     folder, runs = first
-    bench, calls = campaign._bench(settings(folder)), []
+    calls = []
 
-    def run(number):
+    def run(imitator, number):
         calls.append(number)
         raise InputError("it runs again")
 
-    monkeypatch.setattr(bench, "run", run)
+    monkeypatch.setattr(campaign, "_run", run)
     kept = [run_one(settings(folder), number) for number in (0, 1)]
     assert kept == runs and not calls
     with pytest.raises(InputError, match="it runs again"):
@@ -81,13 +83,13 @@ def test_a_run_is_resumed(first, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [one for one in campaign.METHODS if one != campaign.LIBRARY])  # it has whole runs
+@pytest.mark.parametrize("method", [one for one in METHODS if one != LIBRARY])  # it has whole runs
 def test_every_method_gives_a_path_and_a_motion(robot, tmp_path, method):
-    bench = campaign._Bench(settings(tmp_path, SHELF._replace(method=method, mass=0.01)))
-    episode, shown = bench.episode(4)
+    imitator = Imitator(settings(tmp_path, SHELF._replace(method=method, mass=0.01)))
+    episode, shown = imitator.episode(4)
     assert episode.object_body.mass == 0.01 and shown == 4
-    np.testing.assert_array_equal(episode.T_world_target, bench.shown(4)[0].T_world_target)
-    paths, motion = bench.imitated(episode, shown)
+    np.testing.assert_array_equal(episode.T_world_target, imitator.shown(4)[0].T_world_target)
+    paths, motion = imitator.imitated(episode, shown)
     for T in (*paths[0], motion):
         np.testing.assert_allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-4)
     # The gripper moves with the object from the pick to the release.
@@ -95,8 +97,8 @@ def test_every_method_gives_a_path_and_a_motion(robot, tmp_path, method):
 
 
 @pytest.fixture
-def bench(tmp_path, monkeypatch):
-    """A bench by condition, without a robot or networks, whose only episode is two balls on a table."""
+def imitator(tmp_path, monkeypatch):
+    """An imitator by condition, without a robot or networks, whose only episode is two balls on a table."""
     ball = trimesh.creation.icosphere(1, 0.04)
     body = Body([np.asarray(ball.vertices)], 0.1, np.zeros(3), 1e-4 * np.eye(3), ball)
     starts = np.tile(np.eye(4), (2, 1, 1))
@@ -106,12 +108,12 @@ def bench(tmp_path, monkeypatch):
         **{"number": 0, "rejected": 0, "redrawn": 0, "object": shape, "target": shape, "T_target_object": np.eye(4)},
         **{"object_body": body, "target_body": body, "T_world_object": starts[0], "T_world_target": starts[1]},
     )
-    monkeypatch.setattr(campaign._Bench, "episode", lambda self, number: (episode, 0))
+    monkeypatch.setattr(Imitator, "episode", lambda self, number: (episode, 0))
     monkeypatch.setattr("tdf_jax.sim.robot.load_robot", lambda *about: None)
     monkeypatch.setattr("tdf_jax.networks.checkpoint.load_model", lambda name: name)
     monkeypatch.setattr("tdf_jax.networks.model.fingerprint", lambda model: model)
-    monkeypatch.setattr(campaign._Bench, "reference", lambda self, shown: None)
-    return lambda **change: campaign._Bench(settings(tmp_path, SHELF._replace(**change)))
+    monkeypatch.setattr(Imitator, "reference", lambda self, shown: None)
+    return lambda **change: Imitator(settings(tmp_path, SHELF._replace(**change)))
 
 
 def result(**change):
@@ -132,14 +134,14 @@ def refuse(*arguments, **keywords):
         ("tdf_jax.imitation.imitate", refuse, "relate(): the clouds are far apart; expected them in one frame"),
     ],
 )
-def test_an_episode_in_which_nothing_is_found_fails(bench, monkeypatch, mode, where, what, detail):
+def test_an_episode_in_which_nothing_is_found_fails(imitator, monkeypatch, mode, where, what, detail):
     monkeypatch.setattr(where, what)
-    kept = bench(method=campaign.LIBRARY, mode=mode).run(0)
+    kept = campaign._run(imitator(method=LIBRARY, mode=mode), 0)
     assert kept["cause"] == "not found" and detail in kept["detail"]
     assert not (kept["grasp"] or kept["place"] or kept["overall"] or kept["strict"]) and np.isnan(kept["slip"])
 
 
-def test_an_episode_whose_target_no_camera_sees_fails(bench, monkeypatch):
+def test_an_episode_whose_target_no_camera_sees_fails(imitator, monkeypatch):
     """One camera sees the object; the target is hidden from it, as by a wall."""
     from tdf_jax.sim import cameras
 
@@ -151,26 +153,26 @@ def test_an_episode_whose_target_no_camera_sees_fails(bench, monkeypatch):
         return see(model, data, rig, name, **options)
 
     monkeypatch.setattr(cameras, "observed_points", hidden)
-    kept = bench(method=campaign.REPLAY, clouds="views1").run(0)
+    kept = campaign._run(imitator(method=REPLAY, clouds="views1"), 0)
     assert kept["cause"] == "not found" and "none of 1 cameras sees the body 'target'" in kept["detail"]
 
 
-def test_an_outcome_without_motion_is_kept_and_cannot_be_filmed(bench, tmp_path, monkeypatch):
+def test_an_outcome_without_motion_is_kept_and_cannot_be_filmed(imitator, tmp_path, monkeypatch):
     monkeypatch.setattr("tdf_jax.imitation.imitate", refuse)
-    made = bench(method=campaign.LIBRARY)
-    monkeypatch.setattr(campaign, "_bench", lambda settings: made)
+    made = imitator(method=LIBRARY)
+    monkeypatch.setattr(campaign, "load_imitator", lambda settings: made)
     first, again = (run_one(made.settings, 0) for _ in range(2))
     assert first.outcome.cause == again.outcome.cause == "not found" and first.outcome.detail == again.outcome.detail
     with pytest.raises(InputError, match=r"episode 0 has no motion: relate\(\): the clouds are far apart"):
         campaign.film_one(made.settings, 0, tmp_path / "film.gif")
 
 
-def test_the_times_of_an_episode_are_apart(bench, monkeypatch):
+def test_the_times_of_an_episode_are_apart(imitator, monkeypatch):
     """A clock that counts: 2 s of imitation, 4 s of planning, 8 s of physics."""
     now = [0.0]
     monkeypatch.setattr(campaign.time, "perf_counter", lambda: now[0])
 
-    def found(self, episode, shown):
+    def imitated(self, episode, shown):
         now[0] += 2
         return [np.eye(4)[None]], np.eye(4)
 
@@ -180,24 +182,24 @@ def test_the_times_of_an_episode_are_apart(bench, monkeypatch):
         now[0] += 8
         return Outcome.failure("unreachable", "far")
 
-    monkeypatch.setattr(campaign._Bench, "found", found)
+    monkeypatch.setattr(Imitator, "imitated", imitated)
     monkeypatch.setattr("tdf_jax.sim.episode.run_episode", run_episode)
-    made = bench()
-    monkeypatch.setattr(campaign, "_bench", lambda settings: made)
+    made = imitator()
+    monkeypatch.setattr(campaign, "load_imitator", lambda settings: made)
     run = run_one(made.settings, 0)
     assert run.seconds == (2.0, 12.0) and run.planning == 4.0
 
 
 @pytest.mark.parametrize("where", ["episode", "found"], ids=["the episode", "its demonstration"])
-def test_an_episode_that_cannot_be_drawn_ends_no_campaign(bench, monkeypatch, where):
+def test_an_episode_that_cannot_be_drawn_ends_no_campaign(imitator, monkeypatch, where):
     """It is kept as what it is, with the starts that were tried."""
 
     def nothing(self, *about):
         raise NotDrawn("draw_episode(): no bowl_on_shelf is within reach", 25, 1)
 
-    monkeypatch.setattr(campaign._Bench, where, nothing)
-    made = bench()
-    monkeypatch.setattr(campaign, "_bench", lambda settings: made)
+    monkeypatch.setattr(Imitator, where, nothing)
+    made = imitator()
+    monkeypatch.setattr(campaign, "load_imitator", lambda settings: made)
     first, again = (run_one(made.settings, 0) for _ in range(2))
     assert repr(first) == repr(again) and first.outcome.cause == "not drawn" and not first.outcome.drawn
     assert (first.rejected, first.redrawn) == (25, 1) and "within reach" in first.outcome.detail
@@ -205,7 +207,7 @@ def test_an_episode_that_cannot_be_drawn_ends_no_campaign(bench, monkeypatch, wh
         campaign.found_in(made.settings, 0)
 
 
-def test_a_demonstration_that_cannot_be_drawn_is_tried_once(bench, monkeypatch):
+def test_a_demonstration_that_cannot_be_drawn_is_tried_once(imitator, monkeypatch):
     calls = []
 
     def nothing(*arguments):
@@ -213,44 +215,58 @@ def test_a_demonstration_that_cannot_be_drawn_is_tried_once(bench, monkeypatch):
         raise NotDrawn("none is within reach")
 
     monkeypatch.setattr("tdf_jax.sim.tasks.draw_episode", nothing)
-    made = bench()
+    made = imitator()
     for _ in range(2):
         with pytest.raises(NotDrawn, match=r"none is within reach \(of the demonstrations\)"):
             made.shown(3)
     assert len(calls) == 1
 
 
-def test_what_was_imitated_is_kept(bench, monkeypatch):
+def test_what_was_imitated_is_kept(imitator, monkeypatch):
     paths, motion = np.random.default_rng(0).normal(size=(2, 3, 4, 4)), np.diag([1.0, 1, 1, 1])
-    monkeypatch.setattr(campaign._Bench, "found", lambda self, episode, shown: (list(paths), motion))
+    monkeypatch.setattr(Imitator, "imitated", lambda self, episode, shown: (list(paths), motion))
     far = Outcome.failure("unreachable", "far")
     monkeypatch.setattr("tdf_jax.sim.episode.run_episode", lambda *arguments, **keywords: far)
-    made = bench()
-    monkeypatch.setattr(campaign, "_bench", lambda settings: made)
+    made = imitator()
+    monkeypatch.setattr(campaign, "load_imitator", lambda settings: made)
     assert run_one(made.settings, 0).outcome.cause == "unreachable"
-    monkeypatch.setattr(campaign._Bench, "found", lambda *about: pytest.fail("it is imitated again"))
+    monkeypatch.setattr(Imitator, "imitated", lambda *about: pytest.fail("it is imitated again"))
     _, _, kept_paths, kept_motion = campaign.found_in(made.settings, 0)
     np.testing.assert_array_equal(kept_paths, paths)
     np.testing.assert_array_equal(kept_motion, motion)
 
 
+def test_modes_and_masses_share_what_is_imitated(imitator, monkeypatch):
+    """Its time is that of when it was computed; another method imitates again."""
+    calls = []
+
+    def imitated(self, episode, shown):
+        calls.append(self.condition)
+        return [np.eye(4)[None]], np.eye(4)
+
+    monkeypatch.setattr(Imitator, "imitated", imitated)
+    conditions = [{"mode": "execute"}, {"mode": "teleport", "mass": 0.01}, {"method": "even blending"}]
+    seconds = [imitator(**change).found(imitator(**change).episode(0)[0], 0).seconds for change in conditions]
+    assert len(calls) == 2 and seconds[0] == seconds[1]
+
+
 def test_a_found_target_needs_weights_and_meshes_their_folder(tmp_path):
-    found = settings(tmp_path, SHELF._replace(task="bowl_on_mug", target="found", method=campaign.LIBRARY))
+    found = settings(tmp_path, SHELF._replace(task="bowl_on_mug", target="found", method=LIBRARY))
     with pytest.raises(
         InputError, match="there are no weights of a mug, which is to be found; expected --target known"
     ):
         next(run_campaign(found, 1, progress=False))
-    campaign.check_settings(dataclasses.replace(found, target_weights="mug"))
-    campaign.check_settings(dataclasses.replace(found, condition=found.condition._replace(method=TRUTH)))
+    check_settings(dataclasses.replace(found, target_weights="mug"))
+    check_settings(dataclasses.replace(found, condition=found.condition._replace(method=TRUTH)))
     with pytest.raises(InputError, match="objects is 'meshes' and meshes is None; expected a folder for 'meshes'"):
         next(run_campaign(settings(tmp_path, SHELF._replace(objects="meshes")), 1, progress=False))
 
 
-def test_wrong_weights_are_no_failure_of_an_episode(bench, monkeypatch):
-    made = bench(method=campaign.LIBRARY)
-    monkeypatch.setattr(campaign._Bench, "reference", refuse)
+def test_wrong_weights_are_no_failure_of_an_episode(imitator, monkeypatch):
+    made = imitator(method=LIBRARY)
+    monkeypatch.setattr(Imitator, "reference", refuse)
     with pytest.raises(InputError, match="far apart"):
-        made.run(0)
+        campaign._run(made, 0)
 
 
 def test_the_processes_leave_no_setting_behind(monkeypatch):

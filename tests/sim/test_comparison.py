@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from tdf_jax._internal.errors import InputError
-from tdf_jax.sim.campaign import METHODS, Condition, Run, Settings
+from tdf_jax.sim.campaign import Run
 from tdf_jax.sim.comparison import TARGETS, Row, page, planned_rows, reading, record
+from tdf_jax.sim.condition import METHODS, Condition, Settings
 from tdf_jax.sim.episode import Outcome
 from tdf_jax.sim.physics import LIGHT_MASS
 from tdf_jax.sim.published import NDF, Published, peers_of

@@ -10,7 +10,8 @@ from PIL import Image
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.sim import failures
-from tdf_jax.sim.campaign import Condition, Run, Settings
+from tdf_jax.sim.campaign import Run
+from tdf_jax.sim.condition import Condition, Settings
 from tdf_jax.sim.episode import Outcome
 from tdf_jax.sim.failures import check_renderer, failure_sheet, first_failures, picture_one
 

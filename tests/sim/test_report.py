@@ -6,7 +6,8 @@ import json
 import numpy as np
 import pytest
 
-from tdf_jax.sim.campaign import Condition, Run, Settings
+from tdf_jax.sim.campaign import Run
+from tdf_jax.sim.condition import Condition, Settings
 from tdf_jax.sim.episode import Outcome
 from tdf_jax.sim.report import causes, criteria, not_drawn, rates, record, summary
 

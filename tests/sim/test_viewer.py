@@ -8,7 +8,9 @@ import pytest
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.sim import campaign, viewer
+from tdf_jax.sim.condition import Condition, Settings
 from tdf_jax.sim.episode import Outcome
+from tdf_jax.sim.imitator import Found, Imitator
 from tdf_jax.sim.viewer import Viewer, check_display
 
 mujoco = pytest.importorskip("mujoco", reason="the extra 'sim' is not installed")
@@ -147,19 +149,20 @@ def test_a_kept_episode_runs_again_to_be_shown(windows, clock, tmp_path, monkeyp
             watch(cell, data, "path")
         return Outcome(True, True, True, True, "", "", 0.0, 0.0)
 
-    def bench(settings):
-        made = object.__new__(campaign._Bench)
+    def load(settings):
+        made = object.__new__(Imitator)
         made.settings, made.condition = settings, settings.condition
         made.fingerprints, made.robot_content, made.robot, made.scans = [], [], None, []
         return made
 
     monkeypatch.setattr("tdf_jax.sim.episode.run_episode", run_episode)
-    monkeypatch.setattr(campaign, "_bench", bench)
+    monkeypatch.setattr(campaign, "load_imitator", load)
     episode = types.SimpleNamespace(rejected=0, redrawn=0)
-    monkeypatch.setattr(campaign._Bench, "episode", lambda self, number: (episode, 0))
-    monkeypatch.setattr(campaign._Bench, "found", lambda self, episode, shown: ([np.eye(4)[None]], np.eye(4)))
-    condition = campaign.Condition("bowl_on_shelf", "known", "upright", "execute")
-    settings = campaign.Settings(condition, "bowl", None, 0, tmp_path)
+    monkeypatch.setattr(Imitator, "episode", lambda self, number: (episode, 0))
+    found = Found(np.eye(4)[None, None], np.eye(4), "", 1.0)
+    monkeypatch.setattr(Imitator, "found", lambda self, episode, shown: found)
+    condition = Condition("bowl_on_shelf", "known", "upright", "execute")
+    settings = Settings(condition, "bowl", None, 0, tmp_path)
     first = campaign.run_one(settings, 0)
     again = campaign.run_one(settings, 0, view=True)
     assert runs == [False, True] and first == again
@@ -175,8 +178,8 @@ def test_the_first_episode_alone_is_shown(tmp_path, monkeypatch):
             return types.SimpleNamespace(result=lambda: number, cancel=lambda: None)
 
     monkeypatch.setattr(campaign, "process_pool", lambda count: contextlib.nullcontext(Pool()))
-    condition = campaign.Condition("bowl_on_shelf", "known", "upright", "execute")
-    settings = campaign.Settings(condition, "bowl", None, 0, tmp_path)
+    condition = Condition("bowl_on_shelf", "known", "upright", "execute")
+    settings = Settings(condition, "bowl", None, 0, tmp_path)
     assert list(campaign.run_campaign(settings, 3, 1, progress=False, view=True)) == [0, 1, 2]
     assert list(campaign.run_campaign(settings, 1, 1, progress=False)) == [0]
     assert asked == [(0, True), (1, False), (2, False), (0, False)]

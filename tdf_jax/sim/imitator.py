@@ -1,0 +1,312 @@
+"""What is imitated in the episodes of a campaign, by its method: the library, the truth or a baseline."""
+
+import dataclasses
+import functools
+import time
+from collections.abc import Sequence
+from importlib.metadata import version
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from tdf_jax._internal.cache import digest, kept
+from tdf_jax._internal.errors import InputError
+from tdf_jax.sim.condition import (
+    DEMONSTRATIONS,
+    EVEN,
+    ICP,
+    NETWORKS,
+    PAPER,
+    REPLAY,
+    TRUTH,
+    UNCENTRED,
+    Settings,
+)
+from tdf_jax.sim.tasks import TASKS, Episode, NotDrawn
+
+if TYPE_CHECKING:
+    from tdf_jax.energy.reference import Reference
+    from tdf_jax.geometry.demonstration import Demonstration
+    from tdf_jax.sim.replay import Replay
+    from tdf_jax.sim.robot import Robot
+    from tdf_jax.sim.scans import Scan
+
+FORMAT = 8  # format number; raise it when what an episode computes changes
+FIRST_DEMONSTRATION = 1_000_000  # their numbers begin here, so that no episode shares their objects
+POINTS = 1500  # of a complete cloud
+VIEWED = 4000  # most points of a cloud of cameras: the field takes a subsample
+
+
+class Found(NamedTuple):
+    """What is imitated in an episode.
+
+    Attributes:
+        paths: trajectories of the gripper from the pick to the release, (paths, poses, 4, 4), metres, world frame, the
+            best first; none if nothing is found.
+        motion: motion M of the object: a point x of it ends at M x, 4x4.
+        reason: why nothing is found, in words; empty if something is.
+        seconds: time that it took when it was computed, without that of describing the demonstration.
+    """
+
+    paths: Float[np.ndarray, "paths poses 4 4"]
+    motion: Float[np.ndarray, "4 4"]
+    reason: str
+    seconds: float
+
+
+def load_objects(settings: Settings) -> "list[Scan]":
+    """The users' meshes of the task's category, in the order of their names; none if objects are generated.
+
+    Args:
+        settings: what the episodes share.
+
+    Raises:
+        InputError: a mesh cannot be used, or there is none.
+    """
+    if settings.meshes is None:
+        return []
+    from tdf_jax.sim.scans import load_scans
+
+    category = TASKS[settings.condition.task].object
+    return load_scans("tdf simulate", settings.meshes, settings.recursive, category)
+
+
+def centred_path(
+    path: Float[np.ndarray, "poses 4 4"], points: Float[np.ndarray, "points 3"], opening: float, robot: "Robot"
+) -> Float[np.ndarray, "poses 4 4"]:
+    """A path whose pick is centred on the cloud; see `tdf_jax.sim.centring`. The object moves as before.
+
+    Args:
+        path: poses of the gripper's frame from the pick to the release, (poses, 4, 4).
+        points: cloud of the object at the pick, (points, 3), metres, world frame.
+        opening: opening of the fingers before they close, metres.
+        robot: the robot.
+    """
+    from tdf_jax.sim.centring import centred
+
+    return path @ (np.linalg.inv(path[0]) @ centred(path[0], points, opening, robot.fingers))
+
+
+@functools.lru_cache(maxsize=1)
+def load_imitator(settings: Settings) -> "Imitator":
+    """The imitator of a campaign, loaded once in a process.
+
+    Args:
+        settings: what the episodes share.
+    """
+    return Imitator(settings)
+
+
+class Imitator:
+    """Imitates demonstrations in the episodes of a campaign: networks, demonstrations and the robot of one process.
+
+    Attributes:
+        settings: what the episodes share.
+        condition: what they are measured under.
+        robot: the robot.
+    """
+
+    def __init__(self, settings: Settings):
+        """Load the networks, the robot and the users' meshes.
+
+        Args:
+            settings: what the episodes share.
+
+        Raises:
+            InputError: one of them cannot be used.
+        """
+        from tdf_jax.networks.checkpoint import load_model
+        from tdf_jax.networks.model import fingerprint
+        from tdf_jax.sim.robot import load_robot
+
+        self.settings, self.condition = settings, settings.condition
+        self.robot = load_robot(settings.robot, settings.site)
+        self.model = load_model(settings.object_weights)
+        self.target_model = None if settings.target_weights is None else load_model(settings.target_weights)
+        self.fingerprints = [
+            fingerprint(self.model), None if self.target_model is None else fingerprint(self.target_model)
+        ]  # fmt: skip
+        # Of the package's robot nothing: its version is pinned.
+        self.robot_content = [] if settings.robot is None else [digest(settings.robot.read_bytes()), settings.site]
+        self.scans = load_objects(settings)
+        self._shown: dict[int, tuple[Episode, Demonstration] | NotDrawn] = {}
+        self._described: dict[int, Reference] = {}
+        self._paper: dict[int, Reference] = {}
+
+    def scan(self, number: int) -> "Scan | None":
+        """The user's mesh that an episode has; None if its object is generated."""
+        return self.scans[number % len(self.scans)] if self.scans else None
+
+    def shown(self, number: int) -> "tuple[Episode, Demonstration]":
+        """The demonstrated episode and the demonstration.
+
+        Raises:
+            NotDrawn: nothing within reach is drawn.
+        """
+        from tdf_jax.sim.tasks import demonstrate_episode, draw_episode
+
+        if number not in self._shown:
+            try:
+                episode = draw_episode(
+                    self.condition.task, self.robot, self.settings.seed, FIRST_DEMONSTRATION + number, "upright"
+                )
+                self._shown[number] = episode, demonstrate_episode(episode, self.settings.seed)
+            except NotDrawn as error:  # so that it is not tried again for every episode
+                self._shown[number] = error
+        found = self._shown[number]
+        if isinstance(found, NotDrawn):
+            raise NotDrawn(f"{found} (of the demonstrations)")
+        return found
+
+    def reference(self, number: int) -> "Reference":
+        """The descriptors of a demonstration, or of all."""
+        from tdf_jax.energy.reference import describe
+
+        if number not in self._described:
+            several = range(DEMONSTRATIONS) if number < 0 else (number,)
+            demonstrations = [self.shown(one)[1] for one in several]
+            self._described[number] = describe(self.model, demonstrations, target_model=self.target_model)
+        return self._described[number]
+
+    def paper_reference(self, number: int) -> "Reference":
+        """The descriptors of a demonstration for the paper's method."""
+        from tdf_jax.sim.replay import describe_without_target
+
+        if number not in self._paper:
+            self._paper[number] = describe_without_target(self.model, self.shown(number)[1])
+        return self._paper[number]
+
+    def episode(self, number: int):
+        """An episode, and the number of the demonstration that it imitates; -1 for all of them."""
+        from tdf_jax.sim.tasks import draw_episode
+
+        condition, seed = self.condition, self.settings.seed
+        shown = -1 if condition.demonstrations > 1 else number % DEMONSTRATIONS
+        known = self.shown(shown)[0] if condition.target == "known" else None
+        episode = draw_episode(condition.task, self.robot, seed, number, condition.poses, known, self.scan(number))
+        if condition.mass:
+            body = dataclasses.replace(
+                episode.object_body,
+                mass=condition.mass,
+                inertia=episode.object_body.inertia * (condition.mass / episode.object_body.mass),
+            )
+            episode.__dict__["object_body"] = body
+        return episode, shown
+
+    def depends_on(self, number: int) -> list:
+        """All that an episode depends on besides its condition, as JSON values.
+
+        Args:
+            number: number of the episode.
+        """
+        scan = self.scan(number)
+        return [
+            *(FORMAT, version("tdf_jax"), *self.fingerprints, *self.robot_content),
+            *(self.settings.seed, number, None if scan is None else [scan.name, scan.digest]),
+        ]
+
+    def found(self, episode: Episode, shown: int) -> Found:
+        """What is imitated in an episode: kept, or computed and kept.
+
+        Teleported and executed episodes, of whatever mass, share it.
+
+        Args:
+            episode: the episode.
+            shown: number of the demonstration; -1 for all of them.
+
+        Raises:
+            NotDrawn: there is no demonstration.
+            InputError: something is wrong with the weights.
+        """
+        shared = self.condition._replace(mode="", mass=0.0)
+        about = ["imitation", *self.depends_on(episode.number), *shared]
+        result = kept("tdf simulate", self.settings.folder, about, lambda: self._found(episode, shown)._asdict())
+        return Found(result["paths"], result["motion"], result["reason"].item(), float(result["seconds"]))
+
+    def _found(self, episode: Episode, shown: int) -> Found:
+        if self.condition.method in NETWORKS:
+            self.reference(shown)  # what is wrong with the weights is no failure of an episode, and ends the campaign
+        began = time.perf_counter()
+        try:
+            paths, motion = self.imitated(episode, shown)
+        except NotDrawn:  # of the demonstrations
+            raise
+        except InputError as error:
+            return Found(np.zeros((0, 0, 4, 4)), np.eye(4), str(error), time.perf_counter() - began)
+        return Found(np.array(paths), motion, "", time.perf_counter() - began)
+
+    def imitated(self, episode, shown: int) -> tuple[Sequence[np.ndarray], np.ndarray]:
+        """Trajectories of the gripper, the best first, and the motion of the object, by the condition's method.
+
+        Raises:
+            InputError: there are none, or a cloud is empty or too small.
+        """
+        from tdf_jax.sim.tasks import demonstrate_episode
+
+        condition = self.condition
+        true = episode.T_world_target @ episode.T_target_object @ np.linalg.inv(episode.T_world_object)
+        if condition.method == TRUTH:
+            path = demonstrate_episode(episode, self.settings.seed).trajectory
+            return [np.asarray(path.matrices, float)], true
+        points, target_points = self.clouds(episode)
+        known = condition.target == "known"
+        paths, motion = self.replay(episode.number, points, None if known else target_points, shown)
+        if condition.method != UNCENTRED:
+            paths = [centred_path(path, points, episode.grip.opening, self.robot) for path in paths]
+        return paths, motion
+
+    def clouds(self, episode) -> tuple[np.ndarray, np.ndarray]:
+        """Clouds of object and target, (points, 3) each, metres, world frame."""
+        from tdf_jax.evaluation.cases import SEED_SPACE
+        from tdf_jax.evaluation.relation_tasks import moved
+        from tdf_jax.geometry.sampling import sample_surface
+
+        rng = np.random.default_rng([SEED_SPACE, self.settings.seed, episode.number, 9])
+        if self.condition.clouds == "full":
+            return tuple(  # of two: the checker does not count a generator
+                moved(sample_surface(one.mesh, POINTS, rng), T).astype(np.float32)
+                for one, T in ((episode.object, episode.T_world_object), (episode.target, episode.T_world_target))
+            )  # type: ignore[return-value]
+        from tdf_jax.sim.cameras import camera_ring, observed_points
+        from tdf_jax.sim.workcell import OBJECT, TARGET, build_workcell
+
+        cell = build_workcell(
+            None, episode.object_body, episode.T_world_object, episode.target_body, episode.T_world_target
+        )
+        data, several = cell.data(), int(self.condition.clouds.removeprefix("views"))
+        clouds = []
+        for name, T in ((OBJECT, episode.T_world_object), (TARGET, episode.T_world_target)):
+            cameras = camera_ring(several, T[:3, 3], azimuth=rng.uniform(0, 360))
+            seen = observed_points(cell.model, data, cameras, name, rng=rng)
+            chosen = rng.permutation(len(seen))[:VIEWED]
+            clouds.append(seen[np.sort(chosen)].astype(np.float32))
+        return clouds[0], clouds[1]
+
+    def replay(self, number: int, points, target_points, shown: int) -> "Replay":
+        """What a method finds by the clouds."""
+        import jax
+
+        from tdf_jax.imitation import imitate
+        from tdf_jax.sim import replay
+
+        method = self.condition.method
+        key = jax.random.fold_in(jax.random.key(self.settings.seed), number)
+        if method == REPLAY:
+            return replay.replay_by_centroids(self.shown(shown)[1], points, target_points)
+        if method == ICP:
+            return replay.replay_by_registration(self.shown(shown)[1], points, target_points, key=key)
+        result = imitate(
+            self.model,
+            self.reference(shown),
+            points,
+            target_points=target_points,
+            target_model=self.target_model,
+            key=key,
+        )
+        if method == EVEN:
+            return replay.blend_evenly(self.shown(shown)[1], result)
+        found = replay.replay_candidates(result)
+        if method == PAPER:
+            return replay.replay_by_energy(self.model, self.paper_reference(shown), points, result.goal, key=key)
+        return found
