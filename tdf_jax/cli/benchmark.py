@@ -53,6 +53,7 @@ def benchmark(
         tuple[Literal["known", "found"], ...] | None,
         tyro.conf.arg(metavar="[TARGET [TARGET ...]]", help_behavior_hint=_PROTOCOLS),
     ] = None,
+    masks: tuple[Literal["segmented", "simulator"], ...] = ("segmented",),
     episodes: int = 100,
     light: bool = False,
     processes: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_CORES)] = None,
@@ -93,6 +94,7 @@ def benchmark(
             tilt60 with roll and pitch within 60 degrees too, or uniform.
         modes: modes of --simulation: the protocol of NDF and R-NDF, and executed motions.
         targets: targets of --simulation: known where they were demonstrated, or found by their clouds.
+        masks: how points of cameras of --simulation are known to be the object's; see `tdf simulate`.
         episodes: number of episodes in every row of --simulation; 0 for none, with --meshes.
         light: teleported objects of --simulation weigh 0.01 kg, as in NDF and R-NDF.
         processes: number of processes of --simulation, on which the outcomes do not depend.
@@ -125,7 +127,8 @@ def benchmark(
             "--object-weights": (object_weights is not None, (related,)),
             "--target-weights": (target_weights is not None, (related,)),
             "--modes": (modes != ("teleport", "execute"), (simulated,)),
-            "--targets": (targets is not None, (simulated,)), "--episodes": (episodes != 100, (simulated,)),
+            "--targets": (targets is not None, (simulated,)), "--masks": (masks != ("segmented",), (simulated,)),
+            "--episodes": (episodes != 100, (simulated,)),
             "--light": (light, (simulated,)), "--processes": (processes is not None, (simulated,)),
         },
     )  # fmt: skip
@@ -137,9 +140,9 @@ def benchmark(
             {
                 "tasks": _given(tasks, typing.get_args(Task)), "modes": modes, "targets": targets,
                 "pose": _given(pose, ("upright", "tilt60")), "clouds": clouds, "methods": _given(methods, ("tdf_jax",)),
-                "demonstrations": demonstrations or (1,), "light": light, "episodes": episodes, "seed": seed,
-                "processes": processes, "meshes": None if meshes is None else str(meshes), "recursive": recursive,
-                "num_poses": num_poses,
+                "demonstrations": demonstrations or (1,), "light": light, "masks": masks, "episodes": episodes,
+                "seed": seed, "processes": processes, "meshes": None if meshes is None else str(meshes),
+                "recursive": recursive, "num_poses": num_poses,
             },
         )  # fmt: skip
     methods = _given(methods, ("all",))

@@ -54,7 +54,7 @@ def measure(out: Path, settings: dict[str, Any]) -> None:
         settings = {**settings, "methods": METHODS}
     names = ("tasks", "modes", "targets", "pose", "clouds", "methods", "demonstrations", "light")
     objects = [GENERATED] * bool(settings["episodes"]) + [MESHES] * (settings["meshes"] is not None)
-    conditions = planned_rows(*(settings[name] for name in names), objects=objects)
+    conditions = planned_rows(*(settings[name] for name in names), objects=objects, masks=settings["masks"])
     for module in EXTRAS:
         extra(function, module)
     campaigns = []
@@ -86,7 +86,7 @@ def measure(out: Path, settings: dict[str, Any]) -> None:
         condition = campaign.condition
         tqdm.write(
             f"row {number} of {len(campaigns)}: {condition.task}, {condition.mode}, target {condition.target}, "
-            f"{condition.poses}, {condition.clouds} clouds, {condition.demonstrations} shown, {condition.method}, "
+            f"{condition.poses}, {condition.inputs} clouds, {condition.demonstrations} shown, {condition.method}, "
             f"{condition.objects} objects"
         )
         rows.append(Row(campaign, list(run_campaign(campaign, count, settings["processes"]))))

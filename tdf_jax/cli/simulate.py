@@ -19,7 +19,8 @@ def simulate(
     mode: Literal["execute", "teleport"] = "execute",
     demonstrations: int = 1,
     seed: int = 0,
-    clouds: Literal["full", "views3", "views1"] = "full",
+    clouds: Literal["full", "views3", "views1"] = "views1",
+    mask: Literal["segmented", "simulator"] = "segmented",
     method: Literal["tdf_jax", "uncentred", "truth", "rigid replay", "ICP", "even blending", "paper"] = "tdf_jax",
     light: bool = False,
     meshes: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint=_NONE)] = None,
@@ -50,7 +51,9 @@ def simulate(
             gripper, and the placement with the object reset to it, as NDF and R-NDF do.
         demonstrations: 1, each that of a tenth of the episodes, or 10.
         seed: seed of objects, starts and searches.
-        clouds: complete clouds, or what three depth cameras or one see.
+        clouds: what one depth camera or three see of the object, and of a target that is found; or complete clouds.
+        mask: how points of cameras are known to be the object's: table, robot and other objects are removed as from a
+            user's images; or by the simulator's mask.
         method: tdf_jax; uncentred, without centring the grasp on the cloud; the truth; or a baseline. Rigid replay and
             ICP move the demonstrated pick and goal with the clouds. Even blending has our pick and our goal, joined by
             the demonstrated path blended evenly over its poses. The paper's method minimises its energy (k = 0.02)
@@ -107,7 +110,16 @@ def simulate(
         check_display()
     objects = GENERATED if meshes is None else MESHES
     condition = Condition(
-        task, target, pose, mode, clouds, demonstrations, method, LIGHT_MASS if light else 0.0, objects
+        task,
+        target,
+        pose,
+        mode,
+        clouds,
+        demonstrations,
+        method,
+        LIGHT_MASS if light else 0.0,
+        objects,
+        mask,
     )
     check_condition(condition)
     if recursive and meshes is None:

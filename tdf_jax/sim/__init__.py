@@ -9,6 +9,7 @@ Modules:
     scans: objects of users' annotated meshes
     workcell: the table, an arm or a floating gripper, the object and the target
     cameras: depth cameras around a cell, and clouds of what they see
+    segmentation: the cloud of one body from images of the whole scene
     removal_study: what the removal of a table and of flying pixels costs
     kinematics: inverse kinematics of an arm, at a pose and along a path
     posture: the distinct positions of the joints with which the gripper is at a pose

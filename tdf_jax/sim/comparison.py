@@ -15,7 +15,7 @@ from tdf_jax.evaluation.statistics import bootstrap_interval
 from tdf_jax.evaluation.tables import between, markdown, percent
 from tdf_jax.sim import report
 from tdf_jax.sim.campaign import Run
-from tdf_jax.sim.condition import DEMONSTRATIONS, GENERATED, LIBRARY, MESHES, TRUTH, Condition, Settings
+from tdf_jax.sim.condition import DEMONSTRATIONS, GENERATED, LIBRARY, MESHES, SEGMENTED, TRUTH, Condition, Settings
 from tdf_jax.sim.episode import CRITERIA
 from tdf_jax.sim.physics import LIGHT_MASS
 from tdf_jax.sim.published import PAPERS, Published, peers_of
@@ -39,9 +39,10 @@ CHANGES = (
     ("target", "known", "found", "A target that is found instead of a known one"),
     ("clouds", "full", "views3", "Clouds of three cameras instead of complete ones"),
     ("clouds", "full", "views1", "Clouds of one camera instead of complete ones"),
+    ("mask", "simulator", "segmented", "Our own segmentation instead of the simulator's mask"),
     ("demonstrations", 1, 10, "Ten demonstrations instead of one"),
 )
-SAME_EPISODES = ("mode", "clouds", "demonstrations")  # fields that change neither objects nor starts
+SAME_EPISODES = ("mode", "clouds", "mask", "demonstrations")  # fields that change neither objects nor starts
 CONDITIONS = ("target", "poses", "clouds", "shown", "method")  # columns that say what a row is measured under
 
 
@@ -114,6 +115,7 @@ def planned_rows(
     demonstrations: Sequence[int],
     light: bool,
     objects: Sequence[str] = (GENERATED,),
+    masks: Sequence[str] = (SEGMENTED,),
 ) -> list[Condition]:
     """All combinations that can be measured.
 
@@ -129,6 +131,7 @@ def planned_rows(
         demonstrations: numbers of demonstrations, 1 and 10.
         light: whether teleported objects have the mass of those in NDF and R-NDF; executed ones never do.
         objects: names of `tdf_jax.sim.condition.OBJECTS`.
+        masks: names of `tdf_jax.sim.condition.MASKS`, for clouds of cameras.
 
     Raises:
         InputError: an argument is empty, or one of its values is in no combination.
@@ -147,13 +150,23 @@ def planned_rows(
         checks.choice(function, "--demonstrations", count, (1, DEMONSTRATIONS))
     rows = [
         Condition(
-            task, target, start, mode, cloud, count, method, LIGHT_MASS if light and mode == "teleport" else 0.0, kind
+            task,
+            target,
+            start,
+            mode,
+            cloud,
+            count,
+            method,
+            LIGHT_MASS if light and mode == "teleport" else 0.0,
+            kind,
+            mask,
         )
         for task in dict.fromkeys(tasks)
         for mode in dict.fromkeys(modes)
         for kind in dict.fromkeys(objects)
         for target in dict.fromkeys(targets or TARGETS[task])
         for cloud in dict.fromkeys(clouds)
+        for mask in (dict.fromkeys(masks) if cloud != "full" else (SEGMENTED,))
         for start in dict.fromkeys(poses)
         for count in dict.fromkeys(demonstrations)
         for method in dict.fromkeys(methods)
@@ -380,7 +393,7 @@ def _command(settings: Mapping[str, Any]) -> str:
     words = ["tdf", "benchmark", "--simulation"]
     for name, value in settings.items():
         flag = "--" + name.replace("_", "-")
-        if name == "num_poses" and settings.get("meshes") is None:
+        if (name == "num_poses" and settings.get("meshes") is None) or (name == "masks" and list(value) == [SEGMENTED]):
             continue
         if value is True:
             words.append(flag)
@@ -395,7 +408,7 @@ def _conditions(row: Row) -> list[str]:
     condition = row.condition
     method = "**tdf_jax**" if condition.method == LIBRARY else condition.method
     poses = condition.poses + ", meshes" * (condition.objects == MESHES)
-    return [condition.target, poses, condition.clouds, str(condition.demonstrations), method]
+    return [condition.target, poses, condition.inputs, str(condition.demonstrations), method]
 
 
 def _rates(rows: Sequence[Row]) -> str:

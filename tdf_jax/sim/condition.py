@@ -13,6 +13,7 @@ DEMONSTRATIONS = 10  # episodes that demonstrate; with one demonstration, each i
 GENERATED, MESHES = OBJECTS = ("generated", "meshes")
 CLOUDS = ("full", "views3", "views1")
 TARGETS = ("known", "found")
+SEGMENTED, SIMULATOR = MASKS = ("segmented", "simulator")
 LIBRARY, UNCENTRED, TRUTH, REPLAY, ICP = "tdf_jax", "uncentred", "truth", "rigid replay", "ICP"
 EVEN, PAPER = "even blending", "paper"
 METHODS = (LIBRARY, UNCENTRED, TRUTH, REPLAY, ICP, EVEN, PAPER)
@@ -32,6 +33,8 @@ class Condition(NamedTuple):
         method: one of `METHODS`.
         mass: mass of the object, kg; 0 for that by its volume.
         objects: "generated", or "meshes" for those of users, with demonstrations on generated ones.
+        mask: how points of cameras are known to be the object's: by our own segmentation, or by the simulator's mask.
+            Of complete clouds it is "segmented", and means nothing.
     """
 
     task: str
@@ -43,6 +46,12 @@ class Condition(NamedTuple):
     method: str = LIBRARY
     mass: float = 0.0
     objects: str = GENERATED
+    mask: str = SEGMENTED
+
+    @property
+    def inputs(self) -> str:
+        """The clouds and the mask, in words."""
+        return self.clouds + ", simulator's mask" * (self.mask == SIMULATOR)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,11 +90,16 @@ def check_condition(condition: Condition) -> None:
         ("mode", MODES),
         ("clouds", CLOUDS),
         ("method", METHODS),
+        ("mask", MASKS),
         ("objects", OBJECTS),
     ):
         checks.choice(function, name, getattr(condition, name), choices)
     if condition.demonstrations not in (1, DEMONSTRATIONS):
         raise InputError(f"{function}: demonstrations is {condition.demonstrations}; expected 1 or {DEMONSTRATIONS}")
+    if condition.clouds == "full" and condition.mask != SEGMENTED:
+        raise InputError(
+            f"{function}: mask is {condition.mask!r}, and complete clouds need none; expected --clouds of cameras"
+        )
     if TASKS[condition.task].target == "board" and condition.target == "found":
         raise InputError(f"{function}: the shelf of {condition.task} is known; expected --target known")
     if condition.demonstrations > 1 and condition.target == "known":

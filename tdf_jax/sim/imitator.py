@@ -5,7 +5,7 @@ import functools
 import time
 from collections.abc import Sequence
 from importlib.metadata import version
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +19,7 @@ from tdf_jax.sim.condition import (
     NETWORKS,
     PAPER,
     REPLAY,
+    SEGMENTED,
     TRUTH,
     UNCENTRED,
     Settings,
@@ -31,8 +32,9 @@ if TYPE_CHECKING:
     from tdf_jax.sim.replay import Replay
     from tdf_jax.sim.robot import Robot
     from tdf_jax.sim.scans import Scan
+    from tdf_jax.sim.workcell import Workcell
 
-FORMAT = 8  # format number; raise it when what an episode computes changes
+FORMAT = 9  # format number; raise it when what an episode computes changes
 FIRST_DEMONSTRATION = 1_000_000  # their numbers begin here, so that no episode shares their objects
 POINTS = 1500  # of a complete cloud
 VIEWED = 4000  # most points of a cloud of cameras: the field takes a subsample
@@ -250,38 +252,65 @@ class Imitator:
             path = demonstrate_episode(episode, self.settings.seed).trajectory
             return [np.asarray(path.matrices, float)], true
         points, target_points = self.clouds(episode)
-        known = condition.target == "known"
-        paths, motion = self.replay(episode.number, points, None if known else target_points, shown)
+        paths, motion = self.replay(episode.number, points, target_points, shown)
         if condition.method != UNCENTRED:
             paths = [centred_path(path, points, episode.grip.opening, self.robot) for path in paths]
         return paths, motion
 
-    def clouds(self, episode) -> tuple[np.ndarray, np.ndarray]:
-        """Clouds of object and target, (points, 3) each, metres, world frame."""
+    def clouds(self, episode) -> tuple[np.ndarray, np.ndarray | None]:
+        """Clouds of the object and of a target that is found, (points, 3) each, metres, world frame."""
         from tdf_jax.evaluation.cases import SEED_SPACE
         from tdf_jax.evaluation.relation_tasks import moved
         from tdf_jax.geometry.sampling import sample_surface
+        from tdf_jax.sim.workcell import OBJECT, TARGET
 
         rng = np.random.default_rng([SEED_SPACE, self.settings.seed, episode.number, 9])
+        bodies = [(OBJECT, episode.object, episode.T_world_object)]
+        if self.condition.target == "found":
+            bodies.append((TARGET, episode.target, episode.T_world_target))
         if self.condition.clouds == "full":
-            return tuple(  # of two: the checker does not count a generator
-                moved(sample_surface(one.mesh, POINTS, rng), T).astype(np.float32)
-                for one, T in ((episode.object, episode.T_world_object), (episode.target, episode.T_world_target))
-            )  # type: ignore[return-value]
-        from tdf_jax.sim.cameras import camera_ring, observed_points
-        from tdf_jax.sim.workcell import OBJECT, TARGET, build_workcell
+            clouds = [moved(sample_surface(one.mesh, POINTS, rng), T) for _, one, T in bodies]
+        else:
+            clouds = [self.seen(episode, name, T[:3, 3], rng) for name, _, T in bodies]
+        points, *targets = (cloud.astype(np.float32) for cloud in clouds)
+        return points, targets[0] if targets else None
 
+    def seen(self, episode, name: str, centre, rng: np.random.Generator) -> np.ndarray:
+        """What the condition's cameras see of a body, (points, 3), metres, world frame.
+
+        Args:
+            episode: the episode.
+            name: name of the body.
+            centre: where the cameras look, (3,), metres, world frame.
+            rng: random generator of their direction and of the noise.
+        """
+        from tdf_jax.sim.cameras import camera_ring, observed_points
+        from tdf_jax.sim.segmentation import segmented_points
+        from tdf_jax.sim.workcell import build_workcell
+
+        segmented = self.condition.mask == SEGMENTED
         cell = build_workcell(
-            None, episode.object_body, episode.T_world_object, episode.target_body, episode.T_world_target
+            self.robot if segmented else None,
+            *(episode.object_body, episode.T_world_object, episode.target_body, episode.T_world_target),
         )
         data, several = cell.data(), int(self.condition.clouds.removeprefix("views"))
-        clouds = []
-        for name, T in ((OBJECT, episode.T_world_object), (TARGET, episode.T_world_target)):
-            cameras = camera_ring(several, T[:3, 3], azimuth=rng.uniform(0, 360))
-            seen = observed_points(cell.model, data, cameras, name, rng=rng)
-            chosen = rng.permutation(len(seen))[:VIEWED]
-            clouds.append(seen[np.sort(chosen)].astype(np.float32))
-        return clouds[0], clouds[1]
+        cameras = camera_ring(several, centre, azimuth=rng.uniform(0, 360))
+        if segmented:
+            points = segmented_points(cell, data, cameras, centre, rng=rng, own=self.robot_alone)
+        else:
+            points = observed_points(cell.model, data, cameras, name, rng=rng)
+        chosen = rng.permutation(len(points))[:VIEWED]
+        return points[np.sort(chosen)]
+
+    @functools.cached_property
+    def robot_alone(self) -> "tuple[Workcell, Any] | None":
+        """A cell with the robot alone, at home, and its state; None if there is no robot."""
+        from tdf_jax.sim.workcell import build_workcell
+
+        if self.robot is None:
+            return None
+        cell = build_workcell(self.robot)
+        return cell, cell.data()
 
     def replay(self, number: int, points, target_points, shown: int) -> "Replay":
         """What a method finds by the clouds."""

@@ -108,7 +108,7 @@ def summary(runs: Sequence[Run]) -> str:
     used = [one for one in runs if one.outcome.drawn]
     meshes = dict.fromkeys(one.instance for one in runs if one.instance)
     lines = [
-        f"{condition.task}, target {condition.target}, {condition.poses}, {condition.mode}, {condition.clouds} clouds, "
+        f"{condition.task}, target {condition.target}, {condition.poses}, {condition.mode}, {condition.inputs} clouds, "
         f"{condition.demonstrations} demonstration{'s' * (condition.demonstrations > 1)}, {condition.method}: "
         f"{len(used)} episodes"
     ]

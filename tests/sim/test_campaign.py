@@ -153,7 +153,7 @@ def test_an_episode_whose_target_no_camera_sees_fails(imitator, monkeypatch):
         return see(model, data, rig, name, **options)
 
     monkeypatch.setattr(cameras, "observed_points", hidden)
-    kept = campaign._run(imitator(method=REPLAY, clouds="views1"), 0)
+    kept = campaign._run(imitator(method=REPLAY, clouds="views1", target="found", mask="simulator"), 0)
     assert kept["cause"] == "not found" and "none of 1 cameras sees the body 'target'" in kept["detail"]
 
 
@@ -304,6 +304,8 @@ def test_a_centred_path_moves_the_object_as_before(robot):
         ({"poses": "tilt30"}, "poses is 'tilt30'"),
         ({"mode": "think"}, "mode is 'think'"),
         ({"clouds": "views2"}, "clouds is 'views2'"),
+        ({"mask": "simulator"}, "mask is 'simulator', and complete clouds need none"),
+        ({"mask": "by hand", "clouds": "views1"}, "mask is 'by hand'; expected one of"),
         ({"method": "luck"}, "method is 'luck'"),
         ({"target": "found"}, "the shelf of bowl_on_shelf is known"),
         ({"demonstrations": 5}, "demonstrations is 5; expected 1 or 10"),
