@@ -20,8 +20,11 @@ MOST_GENERATED = 6  # generated objects of a category in a picture
 _NONE = "(default: none)"
 Cloud = Literal[
     "full", "views1", "views2", "views3", "views4", "points300", "points1000", "points3000", "noise", "half", "double",
-    "all",
+    "camera1", "camera2", "camera3", "all",
 ]  # fmt: skip
+Clutter = Literal[
+    "none", "table", "neighbour-same", "neighbour-other", "touching-same", "touching-other", "outliers", "all"
+]
 
 
 def evaluate(
@@ -36,6 +39,10 @@ def evaluate(
     num_starts: int = 10,
     iterations: int = 100,
     clouds: tuple[Cloud, ...] = ("full",),
+    clutter: tuple[Clutter, ...] = ("none",),
+    stand: tuple[Literal["upright", "tilt60"], ...] = ("upright",),
+    solver: Literal["adam", "carry"] = "adam",
+    reconstruct: bool = True,
     baselines: bool = False,
     meshes: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint=_NONE)] = None,
     recursive: bool = False,
@@ -58,8 +65,14 @@ def evaluate(
             of a bottle; peg, post or base of a rack, any of whose pegs is right; floor, opening or base of a container.
         num_starts: number of random starts of each transfer; the one with the lowest loss counts.
         iterations: number of Adam's steps.
-        clouds: condition of the new object's cloud: full; from 1, 2 or 4 cameras; 300 to 3000 points; 300 points with 2
-            mm noise; half or double size.
+        clouds: condition of the new object's cloud: full; from 1 to 4 cameras; 300 to 3000 points; 300 points with 2 mm
+            noise; half or double size; or from 1 to 3 depth images with noise, on a table that is removed.
+        clutter: what else the clouds full and camera1 to camera3 show, a fifth of their points: a strip of the table;
+            another object of the same or another category, at 3 cm or touching; outliers.
+        stand: how objects stand on a table, with depth images or clutter: upright, or tilted within 60 degrees.
+        solver: adam, with the settings above; or carry, which tdf imitate uses, with its own settings, and which gives
+            confidences.
+        reconstruct: measure reconstructions too; --no-reconstruct saves a third of the time or more.
         baselines: evaluate also random weights, alignment of principal axes and ICP, on the same cases with as many
             starts.
         meshes: folder of real objects of these categories with a meshes.json; see docs/guide/evaluation.md.
@@ -77,7 +90,6 @@ def evaluate(
     from tdf_jax.evaluation import pick_report
     from tdf_jax.evaluation.annotated_meshes import load_annotated
     from tdf_jax.evaluation.cases import generated_case, mesh_case
-    from tdf_jax.evaluation.conditions import CONDITIONS
     from tdf_jax.evaluation.pick_transfer import BASELINES, compare
     from tdf_jax.evaluation.records import write_record
     from tdf_jax.geometry.winding import libigl
@@ -85,6 +97,7 @@ def evaluate(
     from tdf_jax.solvers.adam import OptimizeConfig
 
     _check_numbers(pairs, seed, size, clouds, meshes, num_poses)
+    conditions = _conditions(clouds, clutter, stand)
     categories = tuple(dict.fromkeys(category or categories_of(weights)))
     _check_place(place, categories)
     _check_outputs(json, card, figures)
@@ -95,6 +108,7 @@ def evaluate(
         "weights": weights, "category": categories, "pairs": pairs, "seed": seed, "size": size, "place": place,
         "num_starts": num_starts, "iterations": iterations, "meshes": None if meshes is None else str(meshes),
         "recursive": recursive, "num_poses": num_poses, "clouds": clouds,
+        "clutter": clutter, "stand": stand, "solver": solver,
     }  # fmt: skip
     targets = [] if meshes is None else load_annotated(meshes, recursive)
     model = load_model(weights)
@@ -115,11 +129,17 @@ def evaluate(
         ]
     outcomes = {}
     for objects, several in makers.items():
-        for condition in (CONDITIONS if "all" in clouds else dict.fromkeys(clouds)) if several else ():
-            print(f"{objects}, cloud {condition}", file=sys.stderr)
-            cases = [make(place=place, clouds=condition) for make in several]
-            outcomes[objects, condition] = compare(
-                cases, model, BASELINES if baselines else (), seed=seed, config=config
+        for name, condition in conditions.items() if several else ():
+            print(f"{objects}, cloud {name}", file=sys.stderr)
+            cases = [make(place=place, **condition) for make in several]
+            outcomes[objects, name] = compare(
+                cases,
+                model,
+                BASELINES if baselines else (),
+                seed=seed,
+                config=config,
+                solver=solver,
+                reconstruct=reconstruct,
             )
             if json is not None:  # the file is written after every condition, because all of them can take hours
                 write_record("tdf evaluate", json, pick_report.record(outcomes, settings, model))
@@ -140,6 +160,31 @@ def _check_numbers(pairs, seed, size, clouds, meshes, num_poses) -> None:
         checks.number("tdf evaluate", "--size", size, 0.01, 1, "metres")
     if not clouds:
         raise InputError("tdf evaluate: --clouds is empty; expected at least one condition, such as full")
+
+
+def _conditions(clouds, clutter, stand) -> dict[str, dict[str, str]]:
+    """The settings of a case for every condition, by the name that tables have for it."""
+    from tdf_jax.evaluation.cases import CLOUDS
+    from tdf_jax.evaluation.pick_report import condition
+    from tdf_jax.evaluation.tabletop import CAMERAS, CLEAN, CLUTTER, CLUTTERED
+
+    if not clutter or not stand:
+        name, example = ("--clutter", "none") if not clutter else ("--stand", "upright")
+        raise InputError(f"tdf evaluate: {name} is empty; expected at least one, such as {example}")
+    conditions = {}
+    for cloud in CLOUDS if "all" in clouds else dict.fromkeys(clouds):
+        for foreign in CLUTTER if "all" in clutter else dict.fromkeys(clutter):
+            if foreign != CLEAN and cloud not in CLUTTERED:
+                if "all" in clouds:
+                    continue
+                raise InputError(
+                    f"tdf evaluate: --clutter {foreign} with --clouds {cloud}; expected one of "
+                    f"{', '.join(CLUTTERED)} with clutter; leave one of the two out"
+                )
+            table = foreign != CLEAN or cloud in CAMERAS
+            for one in dict.fromkeys(stand) if table else ("upright",):
+                conditions[condition(cloud, foreign, one)] = {"clouds": cloud, "clutter": foreign, "stand": one}
+    return conditions
 
 
 def _check_place(place: str | None, categories: tuple[str, ...]) -> None:

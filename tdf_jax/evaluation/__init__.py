@@ -10,6 +10,7 @@ Modules:
     cases: pairs of objects with a true pose
     clearance_study: colliding paths in random scenes, pushed clear
     conditions: complete, partial, sparse and noisy clouds
+    depth_images: depth images of meshes on a table
     demonstration_count: picks from several demonstrations
     metrics: errors of poses and paths
     path_methods: methods that imitate a whole trajectory
@@ -28,5 +29,6 @@ Modules:
     relation_tasks: an object and a target that fit, the true placement, a demonstration
     scene: a demonstration and a target in one world
     statistics: success thresholds and bootstrap intervals
+    tabletop: clouds of an object on a table, from depth images, and with foreign points
     tables: tables as Markdown and as text
 """

@@ -11,6 +11,20 @@ from jaxtyping import Array, Float
 from tdf_jax._internal import checks
 from tdf_jax.evaluation.annotated_meshes import AnnotatedMesh
 from tdf_jax.evaluation.conditions import CONDITIONS, SCALES, observed
+from tdf_jax.evaluation.tabletop import (
+    CAMERAS,
+    CLEAN,
+    CLUTTER,
+    CLUTTERED,
+    NEIGHBOURS,
+    STANDS,
+    build_tabletop,
+    camera_cloud,
+    complete_cloud,
+    moved,
+    place_points,
+    standing,
+)
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.paths import PATHS, SHAPES
@@ -27,6 +41,8 @@ SEED_SPACE = 7_000_001
 # This number is folded into the key of random poses. Start m of a seed is drawn from fold_in(key(seed), m), and must
 # not be the true rotation.
 POSE_STREAM = 0x7D05E
+CLOUDS = (*CONDITIONS, *CAMERAS)
+BESIDE = ("mug", "bowl", "bottle")  # categories of an object of another category that stands beside the object
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,13 +80,23 @@ class Case(Transfer):
     Attributes:
         object_a, object_b: the objects, in their canonical frames.
         instance: name of object b; cases of one object in several poses share it.
-        clouds: condition of `points_b`, one of `tdf_jax.evaluation.conditions.CONDITIONS`.
+        clouds: condition of `points_b`, one of `CLOUDS`.
+        clutter: what else `points_b` shows, one of `tdf_jax.evaluation.tabletop.CLUTTER`.
+        stand: how object b stands on the table, one of `tdf_jax.evaluation.tabletop.STANDS`; empty where there is no
+            table, and its rotation is uniform.
+        own: number of points of `points_b` that are the object's, which come first.
+        seen: how many of 1500 of these are at the place, see `tdf_jax.evaluation.tabletop.place_points`; None where no
+            camera is modelled.
     """
 
     object_a: Shape
     object_b: Shape | AnnotatedMesh
     instance: str
     clouds: str
+    clutter: str = dataclasses.field(default=CLEAN, kw_only=True)
+    stand: str = dataclasses.field(default="", kw_only=True)
+    own: int | None = dataclasses.field(default=None, kw_only=True)
+    seen: int | None = dataclasses.field(default=None, kw_only=True)
 
     @property
     def diagonal(self) -> float:
@@ -130,6 +156,8 @@ def generated_case(
     place: str | None = None,
     clouds: str = "full",
     natural: bool = False,
+    clutter: str = CLEAN,
+    stand: str = "upright",
 ) -> Case:
     """Pair `index` of a seed: two unseen generated objects of one size and symmetry, the second in a random pose.
 
@@ -141,17 +169,20 @@ def generated_case(
             category.
         points: number of points of each complete cloud, uniform by area.
         place: name of a frame of the category; by default the frame at which demonstrations pick.
-        clouds: condition of the second object's cloud; objects and poses do not depend on it.
+        clouds: condition of the second object's cloud; objects do not depend on it, and poses only by whether there
+            is a table: with cameras or clutter.
         natural: each object keeps its own size, as it was drawn, instead of `size` and conditions of size.
+        clutter: what else the cloud shows; not of all conditions.
+        stand: how the second object stands, if there is a table.
 
     Raises:
-        InputError: there is no such condition or place.
+        InputError: there is no such condition, clutter, stand or place.
     """
-    scale = _scale("generated_case", clouds)
+    scale = _scale("generated_case", clouds, clutter, stand)
     size = None if natural else (FAMILIES[category].size if size is None else size) * scale
     a = object_of(category, seed, 2 * index, size)
     b = object_of(category, seed, 2 * index + 1, size, fold=a.fold)
-    return _case(a, b, seed, index, points, place, clouds, f"{category} {index}")
+    return _case(a, b, seed, index, points, place, clouds, f"{category} {index}", clutter, stand)
 
 
 def mug_case(
@@ -162,7 +193,15 @@ def mug_case(
 
 
 def mesh_case(
-    seed: int, pose: int, target: AnnotatedMesh, *, points: int = 1500, place: str | None = None, clouds: str = "full"
+    seed: int,
+    pose: int,
+    target: AnnotatedMesh,
+    *,
+    points: int = 1500,
+    place: str | None = None,
+    clouds: str = "full",
+    clutter: str = CLEAN,
+    stand: str = "upright",
 ) -> Case:
     """A real mesh at its own size in a random pose, with a demonstration on an unseen generated object.
 
@@ -175,16 +214,19 @@ def mesh_case(
         target: the mesh.
         points: number of points of each complete cloud, uniform by area.
         place: name of a frame of the category; by default the frame at which demonstrations pick.
-        clouds: condition of the mesh's cloud; poses and the generated object do not depend on it.
+        clouds: condition of the mesh's cloud; the generated object does not depend on it, and poses only by whether
+            there is a table: with cameras or clutter.
+        clutter: what else the cloud shows; not of all conditions.
+        stand: how the mesh stands, if there is a table.
 
     Raises:
-        InputError: there is no such condition or place.
+        InputError: there is no such condition, clutter, stand or place.
     """
-    scale = _scale("mesh_case", clouds)
+    scale = _scale("mesh_case", clouds, clutter, stand)
     number = zlib.crc32(f"{target.name}/{pose}".encode())
     b = target if scale == 1 else target.scaled(scale)
     a = object_of(b.category, seed, number, size_of(b), b.fold)
-    return _case(a, b, seed, number, points, place, clouds, target.name)
+    return _case(a, b, seed, number, points, place, clouds, target.name, clutter, stand)
 
 
 def place_demonstration(
@@ -212,8 +254,12 @@ def place_demonstration(
     return Demonstration(jax.device_put(case.points_a), trajectory, query)
 
 
-def _scale(function: str, clouds: str) -> float:
-    checks.choice(f"{function}()", "clouds", clouds, CONDITIONS)
+def _scale(function: str, clouds: str, clutter: str, stand: str) -> float:
+    checks.choice(f"{function}()", "clouds", clouds, CLOUDS)
+    checks.choice(f"{function}()", "clutter", clutter, CLUTTER)
+    checks.choice(f"{function}()", "stand", stand, STANDS)
+    if clutter != CLEAN:
+        checks.choice(f"{function}()", "clouds, with clutter,", clouds, CLUTTERED)
     return SCALES.get(clouds, 1.0)
 
 
@@ -226,16 +272,26 @@ def _case(
     place: str | None,
     clouds: str,
     instance: str,
+    clutter: str,
+    stand: str,
 ) -> Case:
     places = FAMILIES[a.category].places
     place = places[0] if place is None else place
     checks.choice("generated_case()", f"place of a {a.category}", place, places)
     rng = np.random.default_rng([SEED_SPACE, seed, number, 1])
     cloud_a, cloud_b = (sample_surface(one.mesh, points, rng) for one in (a, b))
-    # All conditions share this random stream, so that they differ by the condition and not by chance.
-    seen = observed(b.mesh, clouds, cloud_b, np.random.default_rng([SEED_SPACE, seed, number, 2]))
-    T_world_b = random_pose(seed, number)
-    points_b = seen @ T_world_b[:3, :3].T + T_world_b[:3, 3]
+    others = b.others(place) if isinstance(b, Shape) else ()
+    table = clouds in CAMERAS or clutter != CLEAN
+    if table:
+        points_b, T_world_b, own = _on_table(b, seed, number, clouds, clutter, stand, cloud_b)
+    else:
+        # All conditions share this random stream, so that they differ by the condition and not by chance.
+        seen = observed(b.mesh, clouds, cloud_b, np.random.default_rng([SEED_SPACE, seed, number, 2]))
+        T_world_b = random_pose(seed, number)
+        points_b, own = moved(seen, T_world_b), len(seen)
+    at_place = None
+    if clouds in CAMERAS:
+        at_place = place_points(moved(points_b[:own], np.linalg.inv(T_world_b)), [b.frames[place], *others], b.fold)
     return Case(
         points_a=cloud_a.astype(np.float32),
         points_b=points_b.astype(np.float32),
@@ -248,5 +304,31 @@ def _case(
         instance=instance,
         clouds=clouds,
         scale=SCALES.get(clouds, 1.0),
-        others=tuple(T_world_b @ T for T in b.others(place)) if isinstance(b, Shape) else (),
+        others=tuple(T_world_b @ T for T in others),
+        clutter=clutter,
+        stand=stand if table else "",
+        own=own,
+        seen=at_place,
     )
+
+
+def _on_table(b, seed, number, clouds, clutter, stand, cloud):
+    """The cloud of an object on a table, its pose, and the number of the object's points, which come first."""
+    # Every part has a random stream of its own, so that conditions differ by the condition and not by chance.
+    streams = (np.random.default_rng([SEED_SPACE, seed, number, stream]) for stream in (8, 9, 10, 11))
+    of_pose, of_scene, of_neighbour, of_cloud = streams
+    T_world_b = standing(b.mesh, stand, of_pose)
+    neighbour = None
+    if clutter in NEIGHBOURS:
+        others = [category for category in BESIDE if category != b.category]
+        category = b.category if clutter.endswith("same") else str(of_neighbour.choice(others))
+        # Its size is the object's if it is of the same category, and common otherwise.
+        size = size_of(b) if category == b.category else FAMILIES[category].size
+        drawn = FAMILIES[category].build(FAMILIES[category].sample(of_neighbour))
+        neighbour = scaled(drawn, size / size_of(drawn)).mesh
+    scene = build_tabletop(b.mesh, T_world_b, CAMERAS.get(clouds, 0), of_scene, neighbour, NEIGHBOURS.get(clutter, 0.0))
+    if clouds in CAMERAS:
+        points, own = camera_cloud(scene, clutter, of_cloud)
+    else:
+        points, own = complete_cloud(scene, clutter, cloud, of_cloud)
+    return points, T_world_b, own

@@ -3,10 +3,13 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from tdf_jax.evaluation.pick_transfer import OVERLAPS, Outcome
+import numpy as np
+
+from tdf_jax.evaluation.pick_transfer import ADAM, CARRY, OVERLAPS, Outcome
 from tdf_jax.evaluation.records import header
 from tdf_jax.evaluation.statistics import THRESHOLDS
 from tdf_jax.evaluation.tables import aligned, between, markdown, percent
+from tdf_jax.evaluation.tabletop import CLEAN, STANDS
 from tdf_jax.networks.model import Model
 from tdf_jax.networks.occupancy import parameter_count
 from tdf_jax.shapes import FAMILIES
@@ -14,11 +17,23 @@ from tdf_jax.shapes import FAMILIES
 # Thresholds that the tables show; the record has all of them. A coarser one would not tell networks apart.
 SHOWN = {name: THRESHOLDS[name].label() for name in ("5mm_5deg", "1cm_10deg", "2cm_20deg")}
 SYMMETRY_HEADS = ["symmetry", "cases", "IoU", "refined", *SHOWN.values(), "axis: 2 cm, 20 deg"]
+SIGHT_HEADS = ["place", "cases", *SHOWN.values(), "confidence < 0.5"]
 MEANINGS = {
     "full": "complete, 1500 points",
     "views4": "seen by four depth cameras",
+    "views3": "seen by three",
     "views2": "seen by two",
     "views1": "seen by one",
+    "camera1": "one depth image, on a table",
+    "camera2": "two depth images",
+    "camera3": "three depth images",
+    "table": "strip of the table",
+    "neighbour-same": "another of its category at 3 cm",
+    "neighbour-other": "an object of another category at 3 cm",
+    "touching-same": "another of its category that touches it",
+    "touching-other": "an object of another category that touches it",
+    "outliers": "outliers",
+    "tilt60": "tilted within 60 degrees",
     "points300": "300 points",
     "points1000": "1000 points",
     "points3000": "3000 points",
@@ -27,7 +42,23 @@ MEANINGS = {
     "double": "twice as large",
 }
 
-Outcomes = Mapping[tuple[str, str], Sequence[Outcome]]  # outcomes by objects and condition of the cloud
+Outcomes = Mapping[tuple[str, str], Sequence[Outcome]]  # outcomes by objects and `condition` of the cloud
+
+
+def condition(clouds: str, clutter: str = CLEAN, stand: str = STANDS[0]) -> str:
+    """The name of a condition of the cloud in tables, such as "camera1, outliers, tilt60".
+
+    Args:
+        clouds: condition, one of `tdf_jax.evaluation.cases.CLOUDS`.
+        clutter: what else the cloud shows, one of `tdf_jax.evaluation.tabletop.CLUTTER`.
+        stand: how the object stands on a table, one of `tdf_jax.evaluation.tabletop.STANDS`.
+    """
+    return ", ".join([clouds, *([] if clutter == CLEAN else [clutter]), *([] if stand == STANDS[0] else [stand])])
+
+
+def meaning(name: str) -> str:
+    """The words for the name of a `condition`, for readers who do not know the names."""
+    return "; ".join(MEANINGS[part] for part in name.split(", "))
 
 
 def label(category: str, real: bool = False) -> str:
@@ -59,7 +90,7 @@ def table(outcomes: Outcomes, settings: Mapping[str, Any]) -> str:
     for objects, first, rows in _by_objects(outcomes):
         title = (
             f"{objects}: {first['objects']} objects, {first['cases']} transfers of the {place(objects, settings)}; "
-            f"best of {settings['num_starts']} starts by loss"
+            f"{_picks(settings)}"
         )
         lines = [[*heads, *SHOWN.values()], units, *(_table_cells(clouds, outcome) for clouds, outcome in rows)]
         blocks.append(f"{title}\n{aligned(lines)}")
@@ -68,6 +99,9 @@ def table(outcomes: Outcomes, settings: Mapping[str, Any]) -> str:
         ]
         if parts:
             blocks.append(aligned([["method", "cloud", *SYMMETRY_HEADS], *parts]))
+        parts = [[outcome.method, clouds, *cells] for clouds, outcome in rows for cells in _by_sight(outcome.summary)]
+        if parts:
+            blocks.append(aligned([["method", "cloud", *SIGHT_HEADS], *parts], words=3))
     return "\n\n".join(blocks)
 
 
@@ -99,12 +133,22 @@ def card(model: Model, outcomes: Outcomes, settings: Mapping[str, Any]) -> str:
         )
         blocks.append(markdown([*heads, *SHOWN.values()], [_card_cells(clouds, outcome) for clouds, outcome in rows]))
         parts = [
-            [MEANINGS[clouds], outcome.method, *cells]
+            [meaning(clouds), outcome.method, *cells]
             for clouds, outcome in rows
             for cells in _by_symmetry(outcome.summary)
         ]
         if parts:
             blocks += ["The same by symmetry:", markdown(["cloud", "method", *SYMMETRY_HEADS], parts)]
+        parts = [
+            [meaning(clouds), outcome.method, *cells]
+            for clouds, outcome in rows
+            for cells in _by_sight(outcome.summary)
+        ]
+        if parts:
+            blocks += [
+                "The same by whether the place is seen:",
+                markdown(["cloud", "method", *SIGHT_HEADS], parts),
+            ]
     return "\n\n".join(blocks) + "\n"
 
 
@@ -117,8 +161,12 @@ def record(outcomes: Outcomes, settings: Mapping[str, Any], model: Model) -> dic
         model: the network.
     """
     rows = [
-        {"set": objects, "clouds": clouds, "method": outcome.method} | outcome.summary | {"errors": _errors(outcome)}
-        for (objects, clouds), several in outcomes.items()
+        {"set": objects}
+        | {name: getattr(outcome.cases[0], name) for name in ("clouds", "clutter", "stand")}
+        | {"method": outcome.method}
+        | outcome.summary
+        | {"errors": _errors(outcome)}
+        for (objects, _), several in outcomes.items()
         for outcome in several
     ]
     return header(settings, model) | {"rows": rows}
@@ -141,13 +189,16 @@ def _method(settings: Mapping[str, Any]) -> str:
             "num_poses": settings["num_poses"],
         }
     options |= {name: settings[name] for name in ("category", "clouds")}
+    plain = {"clutter": (CLEAN,), "stand": STANDS[:1], "solver": ADAM}
+    options |= {name: settings[name] for name, usual in plain.items() if settings.get(name, usual) != usual}
     words = " ".join(
         f"--{name.replace('_', '-')} {' '.join(value) if isinstance(value, list | tuple) else value}"
         for name, value in options.items()
     )
     return (
         "One pose at a place, demonstrated on a generated object of the same size and symmetry; the target is in a "
-        f"uniform random pose; best of {settings['num_starts']} starts by loss (`tdf evaluate {words}`). Errors are "
+        f"uniform random pose, or stands on a table where there is one; {_picks(settings)} (`tdf evaluate {words}`). "
+        "Errors are "
         "from the nearest of the poses that the symmetry of the target makes equal. Success: position and rotation "
         "error are both within the bounds; in brackets the 95 % bootstrap interval over objects."
     )
@@ -164,7 +215,7 @@ def _table_cells(clouds: str, outcome: Outcome) -> list[str]:
 def _card_cells(clouds: str, outcome: Outcome) -> list[str]:
     row = outcome.summary
     return [
-        MEANINGS[clouds],
+        meaning(clouds),
         outcome.method,
         *_overlaps(row),
         f"{row['position_median_cm']:.2f} / {row['position_p90_cm']:.2f} cm",
@@ -190,6 +241,21 @@ def _by_symmetry(row: dict) -> list[list[str]]:
     ]
 
 
+def _by_sight(row: dict) -> list[list[str]]:
+    """Cells under `SIGHT_HEADS`, a line for the cases with the place seen, and one with it hidden."""
+    return [
+        [name, str(part["cases"]), *_successes(part), percent(part["doubted"])]
+        for name, part in row["by_sight"].items()
+    ]
+
+
+def _picks(settings: Mapping[str, Any]) -> str:
+    """How picks are found, in words."""
+    if settings.get("solver") == CARRY:
+        return "picks of tdf.imitate"
+    return f"best of {settings['num_starts']} starts by loss"
+
+
 def _overlaps(row: dict) -> list[str]:
     """IoU of a summary as encoded and refined."""
     return ["n/a" if row[name] is None else f"{row[name]:.3f}" for name in OVERLAPS]
@@ -201,11 +267,15 @@ def _successes(row: dict) -> list[str]:
 
 
 def _errors(outcome: Outcome) -> list[dict]:
-    several = zip(
-        outcome.cases, outcome.distance, outcome.angle, *(outcome.ious[name] for name in OVERLAPS), strict=True
-    )
     return [
-        {"object": case.instance, "position_cm": 100 * float(distance), "rotation_deg": float(angle)}
-        | dict(zip(OVERLAPS, ious))
-        for case, distance, angle, *ious in several
+        {
+            "object": case.instance,
+            "position_cm": 100 * float(outcome.distance[index]),
+            "rotation_deg": float(outcome.angle[index]),
+            **{name: outcome.ious[name][index] for name in OVERLAPS},
+            "confidence": None if np.isnan(outcome.confidence[index]) else float(outcome.confidence[index]),
+            "place_points": case.seen,
+            "foreign": None if case.own is None else len(case.points_b) - case.own,
+        }
+        for index, case in enumerate(outcome.cases)
     ]

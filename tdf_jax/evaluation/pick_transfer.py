@@ -1,6 +1,7 @@
 """Transfer of one pose at a semantic place: by a network and by baselines, with errors and reconstruction overlaps."""
 
 import dataclasses
+import warnings
 from collections.abc import Mapping, Sequence
 
 import jax
@@ -9,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
-from tdf_jax._internal.errors import InputError
+from tdf_jax._internal import checks
+from tdf_jax._internal.errors import CategoryWarning, ConfidenceWarning, InputError
 from tdf_jax.energy.descriptors import pose_descriptor
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference
@@ -17,19 +19,25 @@ from tdf_jax.evaluation.baselines import METHODS, aligned
 from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, Case, Transfer
 from tdf_jax.evaluation.metrics import FLIP_DEGREES, nearest_place, pose_error
 from tdf_jax.evaluation.statistics import SUCCESS, THRESHOLDS, percentiles, success_rates
+from tdf_jax.evaluation.tabletop import SEEN_POINTS
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.query import box_query
 from tdf_jax.geometry.symmetry import FOLDS
 from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.imitation import imitate
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.model import Model
 from tdf_jax.networks.occupancy import initialise
 from tdf_jax.networks.refinement import refine
 from tdf_jax.solvers.adam import OptimizeConfig, optimize
+from tdf_jax.uncertainty.doubt import DOUBT
 
 OVERLAPS = ("iou", "iou_refined")
 UNTRAINED = "random weights"
 BASELINES = (UNTRAINED, *METHODS)
+ADAM, CARRY = "adam", "carry"
+SOLVERS = (ADAM, CARRY)
+SIGHTS = ("seen", "hidden")  # parts of a row: the place is seen, or it is not
 
 
 def transferred(
@@ -61,6 +69,34 @@ def transferred(
         result = optimize(field, reference, key, fix_last=False, energy=EnergyWeights(0.0), config=config)
         estimates.append(result.trajectory.wxyz_xyz[0])
     return np.stack(estimates)
+
+
+def imitated(
+    model: Model, cases: Sequence[Transfer], *, seed: int = 0, progress: bool = True
+) -> tuple[Float[np.ndarray, "cases 7"], Float[np.ndarray, " cases"]]:
+    """Transfer the pose at the place in every case by `imitate`, with its default settings.
+
+    Args:
+        model: the network.
+        cases: the transfers.
+        seed: seed of the query points and the starts.
+        progress: show a progress bar.
+
+    Returns:
+        Estimated poses `wxyz_xyz` of the place on object b, (cases, 7), world frame; and `result.confidence`, (cases,),
+        NaN with weights for which it is not calibrated.
+    """
+    query_key, start_key = jax.random.split(jax.random.key(seed))
+    estimates, confidences = [], []
+    for index, case in enumerate(tqdm(cases, desc="imitating", disable=not progress)):
+        reference = place_reference(model, case, box_query(query_key, count=QUERIES, size=QUERY_SIZE * case.scale))
+        with warnings.catch_warnings():  # the table counts the doubtful picks
+            warnings.simplefilter("ignore", CategoryWarning)
+            warnings.simplefilter("ignore", ConfidenceWarning)
+            result = imitate(model, reference, case.points_b, key=jax.random.fold_in(start_key, index), fix_last=False)
+        estimates.append(np.asarray(result.trajectory.wxyz_xyz[0]))
+        confidences.append(float(result.confidence))
+    return np.stack(estimates), np.array(confidences)
 
 
 def place_errors(
@@ -166,6 +202,7 @@ class Outcome:
         angle: rotation errors, (cases,), degrees.
         ious: reconstruction overlaps, see `overlaps`.
         summary: statistics of the errors, see `summary`.
+        confidence: `result.confidence`, (cases,); NaN where it is not calibrated, and with other solvers than `carry`.
     """
 
     method: str
@@ -175,6 +212,7 @@ class Outcome:
     angle: Float[np.ndarray, " cases"]
     ious: Mapping[str, Sequence[float | None]]
     summary: dict
+    confidence: Float[np.ndarray, " cases"]
 
 
 def compare(
@@ -185,6 +223,8 @@ def compare(
     seed: int = 0,
     config: OptimizeConfig = OptimizeConfig(),
     progress: bool = True,
+    solver: str = ADAM,
+    reconstruct: bool = True,
 ) -> list[Outcome]:
     """Run a network and baselines on the same cases, each from as many starts.
 
@@ -193,23 +233,32 @@ def compare(
         model: the network.
         baselines: names of `BASELINES`; their reconstructions, if any, are not measured.
         seed: seed of the query points, the starts and the bootstrap.
-        config: settings of the optimiser.
+        config: settings of the optimiser, and the number of starts of the baselines.
         progress: show progress bars.
+        solver: "adam", the optimiser; or "carry", the default of `imitate`, with its own settings.
+        reconstruct: measure the reconstructions of the network, too.
 
     Raises:
-        InputError: there is no such baseline.
+        InputError: there is no such baseline or solver.
     """
+    checks.choice("compare()", "solver", solver, SOLVERS)
     for method in baselines:
         if method not in BASELINES:
             raise InputError(f"compare(): baselines has {method!r}; expected some of {', '.join(BASELINES)}")
-    estimates = transferred(model, cases, seed=seed, config=config, progress=progress)
-    outcomes = [_outcome(model.info.name, cases, estimates, overlaps(model, cases), seed)]
+
+    def found(network):
+        if solver == CARRY:
+            return imitated(network, cases, seed=seed, progress=progress)
+        return transferred(network, cases, seed=seed, config=config, progress=progress), None
+
+    ious = overlaps(model, cases) if reconstruct else no_overlaps(cases)
+    outcomes = [_outcome(model.info.name, cases, *found(model), ious, seed)]
     for method in baselines:
         if method == UNTRAINED:
-            estimates = transferred(random_weights(model, seed), cases, seed=seed, config=config, progress=progress)
+            estimates, _ = found(random_weights(model, seed))
         else:
             estimates = aligned(method, cases, seed=seed, num_starts=config.num_starts, progress=progress)
-        outcomes.append(_outcome(method, cases, estimates, no_overlaps(cases), seed))
+        outcomes.append(_outcome(method, cases, estimates, None, no_overlaps(cases), seed))
     return outcomes
 
 
@@ -230,6 +279,7 @@ def summary(
     cases: Sequence[Case],
     seed: int = 0,
     tilt: Float[np.ndarray, " cases"] | None = None,
+    confidence: Float[np.ndarray, " cases"] | None = None,
 ) -> dict:
     """Medians, 90th percentiles, success rates with 95 % bootstrap intervals over objects, and flips.
 
@@ -241,10 +291,12 @@ def summary(
         seed: seed of the bootstrap.
         tilt: errors of the upright axis of the place, (cases,), degrees. They separate objects that stand upright but
             are rotated about their axis from the other failures.
+        confidence: confidences of the picks, (cases,); NaN where there is none.
 
     Returns:
         Plain numbers by name; None for an IoU that no case has, and for the intervals of a single object. The key
-        "by_symmetry" holds success rates and IoUs of the objects of each symmetry.
+        "by_symmetry" holds success rates and IoUs of the objects of each symmetry; "by_sight", if cameras are modelled,
+        success rates of the cases in which the place is seen and hidden, and the share with a confidence below 0.5.
     """
     diagonals = distance / [case.diagonal for case in cases]
     known = {name: [iou for iou in several if iou is not None] for name, several in ious.items()}
@@ -260,6 +312,7 @@ def summary(
         "flips": int(np.sum(angle > FLIP_DEGREES)),
         **success_rates(distance, angle, objects, seed),
         "by_symmetry": _by_symmetry(distance, angle, ious, cases, tilt),
+        "by_sight": _by_sight(distance, angle, cases, seed, confidence),
     }
 
 
@@ -282,10 +335,29 @@ def _by_symmetry(distance, angle, ious, cases, tilt) -> dict:
     return parts
 
 
-def _outcome(method, cases, estimates, ious, seed) -> Outcome:
+def _by_sight(distance, angle, cases, seed, confidence) -> dict:
+    """Success rates of the cases in which cameras see the place, and of those in which they do not."""
+    if any(case.seen is None for case in cases):
+        return {}
+    seen, parts = np.array([case.seen >= SEEN_POINTS for case in cases]), {}
+    for name, chosen in zip(SIGHTS, (seen, ~seen)):
+        if not chosen.any():
+            continue
+        objects = [case.instance for case, is_chosen in zip(cases, chosen) if is_chosen]
+        known = None if confidence is None or np.isnan(confidence).any() else confidence[chosen]
+        parts[name] = {
+            "cases": int(chosen.sum()),
+            **success_rates(distance[chosen], angle[chosen], objects, seed),
+            "doubted": None if known is None else float(np.mean(known < DOUBT)),
+        }
+    return parts
+
+
+def _outcome(method, cases, estimates, confidence, ious, seed) -> Outcome:
     distance, angle = place_errors(estimates, cases)
-    row = summary(distance, angle, ious, cases, seed, tilts(estimates, cases))
-    return Outcome(method, cases, estimates, distance, angle, ious, row)
+    row = summary(distance, angle, ious, cases, seed, tilts(estimates, cases), confidence)
+    known = np.full(len(cases), np.nan) if confidence is None else confidence
+    return Outcome(method, cases, estimates, distance, angle, ious, row, known)
 
 
 def _overlap(estimate, truth):

@@ -686,10 +686,12 @@ def test_pictures_of_an_evaluation(weights, real, tmp_path, monkeypatch):
 
 
 def test_every_condition_can_be_asked_for():
-    from tdf_jax.cli.evaluate import Cloud
-    from tdf_jax.evaluation.conditions import CONDITIONS
+    from tdf_jax.cli.evaluate import Cloud, Clutter
+    from tdf_jax.evaluation.cases import CLOUDS
+    from tdf_jax.evaluation.tabletop import CLUTTER
 
-    assert typing.get_args(Cloud) == (*CONDITIONS, "all")
+    assert typing.get_args(Cloud) == (*CLOUDS, "all")
+    assert typing.get_args(Clutter) == (*CLUTTER, "all")
 
 
 @pytest.mark.parametrize(("words", "message"), [
