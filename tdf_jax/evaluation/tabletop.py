@@ -114,7 +114,7 @@ def build_tabletop(
     near, far = 0.0, float(np.linalg.norm(mesh.extents) + np.linalg.norm(other.extents)) + gap
     while far - near > 1e-4:
         between = (near + far) / 2
-        if tree.query(surface + between * direction)[0].min() > gap:
+        if np.isinf(tree.query(surface + between * direction, distance_upper_bound=gap)[0]).all():
             far = between
         else:
             near = between
