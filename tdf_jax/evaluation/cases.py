@@ -85,7 +85,7 @@ class Case(Transfer):
         stand: how object b stands on the table, one of `tdf_jax.evaluation.tabletop.STANDS`; empty where there is no
             table, and its rotation is uniform.
         own: number of points of `points_b` that are the object's, which come first.
-        seen: how many of 1500 of these are at the place, see `tdf_jax.evaluation.tabletop.place_points`; None where no
+        seen: how many of 1500 of these are in the box of query points at the place, see `tdf_jax.evaluation.tabletop.place_points`; None where no
             camera is modelled.
     """
 
@@ -291,7 +291,8 @@ def _case(
         points_b, own = moved(seen, T_world_b), len(seen)
     at_place = None
     if clouds in CAMERAS:
-        at_place = place_points(moved(points_b[:own], np.linalg.inv(T_world_b)), [b.frames[place], *others], b.fold)
+        local = moved(points_b[:own], np.linalg.inv(T_world_b))
+        at_place = place_points(local, [b.frames[place], *others], b.fold, QUERY_SIZE)
     return Case(
         points_a=cloud_a.astype(np.float32),
         points_b=points_b.astype(np.float32),

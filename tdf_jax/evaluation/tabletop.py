@@ -39,8 +39,7 @@ ASIDE = np.pi / 3, 2 * np.pi / 3
 NEAREST_REACH = 0.12  # metres around the object's bounding box in which the nearest points of others are looked for
 NEAREST_OF = 4000  # points of the object from which they are measured
 NEAR_OUTLIERS, FAR_OUTLIERS = 0.05, (0.3, 1.0)  # metres: around the object's bounding box, and from its middle
-# A place is seen if so many of 1500 of the object's points are this near to it, metres.
-SEEN_POINTS, SEEN_RADIUS, SEEN_OF = 20, 0.02, 1500
+SEEN_POINTS, SEEN_OF = 20, 1500  # a place is seen if so many of so many points of the object are in its box
 TURNS = 36  # of a round object, at which its equivalent places are looked for
 
 
@@ -220,26 +219,23 @@ def segmented(
 
 
 def place_points(
-    own: Float[np.ndarray, "points 3"],
-    T_object_places: list[Float[np.ndarray, "4 4"]],
-    fold: int,
-    radius: float = SEEN_RADIUS,
+    own: Float[np.ndarray, "points 3"], T_object_places: list[Float[np.ndarray, "4 4"]], fold: int, size: float
 ) -> int:
-    """How many of 1500 points of an object are at a place: within a radius of it, or of one that is equivalent to it.
+    """How many of 1500 points of an object are at a place, or at one that is equivalent to it.
 
     Args:
         own: points of the object, (points, 3), metres, object frame.
         T_object_places: the place, and others that are as right, (4, 4) each.
         fold: symmetry of the object, see `tdf_jax.geometry.symmetry`.
-        radius: distance from the origin of the place, metres.
+        size: edge of the box in which points are at the place, in its frame, metres.
 
     Returns:
         The number, scaled from the number of points to 1500.
     """
     turns = [about_z(2 * np.pi * turn / (fold or TURNS)) for turn in range(TURNS if fold == ROUND else fold)]
-    origins = np.array([(turn @ T)[:3, 3] for turn in turns for T in T_object_places])
-    counts = KDTree(own).query_ball_point(origins, radius, return_length=True)
-    return round(float(counts.max()) * SEEN_OF / len(own))
+    places = [turn @ T for turn in turns for T in T_object_places]
+    most = max(np.count_nonzero((np.abs(moved(own, np.linalg.inv(T))) < size / 2).all(axis=1)) for T in places)
+    return round(most * SEEN_OF / len(own))
 
 
 def moved(points: Float[np.ndarray, "points 3"], T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "points 3"]:

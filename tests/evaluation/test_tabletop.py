@@ -128,12 +128,12 @@ def test_a_place_is_seen_by_the_points_around_it_or_around_an_equivalent_one():
     frame[:3, 3] = 0.05, 0, 0
     near, opposite, above = (np.tile(x, (30, 1)) for x in ([0.06, 0, 0], [-0.06, 0, 0.01], [0, 0, 0.1]))
     cloud = np.concatenate([near, above, above, above, above])
-    assert place_points(cloud, [frame], 1) == 300  # a fifth of 1500
+    assert place_points(cloud, [frame], 1, 0.06) == 300  # a fifth of 1500
     cloud = np.concatenate([opposite, above])
-    assert [place_points(cloud, [frame], fold) for fold in (1, 2, 4, 0)] == [0, 750, 750, 750]
+    assert [place_points(cloud, [frame], fold, 0.06) for fold in (1, 2, 4, 0)] == [0, 750, 750, 750]
     other = np.diag([1.0, 1, 1, 1])
     other[:3, 3] = -0.05, 0, 0
-    assert place_points(cloud, [frame, other], 1) == 750
+    assert place_points(cloud, [frame, other], 1, 0.06) == 750
 
 
 def test_rows_are_divided_by_whether_the_place_is_seen():
