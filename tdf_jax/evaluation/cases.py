@@ -85,8 +85,8 @@ class Case(Transfer):
         stand: how object b stands on the table, one of `tdf_jax.evaluation.tabletop.STANDS`; empty where there is no
             table, and its rotation is uniform.
         own: number of points of `points_b` that are the object's, which come first.
-        seen: how many of 1500 of these are in the box of query points at the place, see `tdf_jax.evaluation.tabletop.place_points`; None where no
-            camera is modelled.
+        seen: how many of 1500 of these are in the box of query points at the place, see
+            `tdf_jax.evaluation.tabletop.place_points`; None where no camera is modelled.
     """
 
     object_a: Shape
