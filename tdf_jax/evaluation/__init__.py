@@ -31,4 +31,5 @@ Modules:
     statistics: success thresholds and bootstrap intervals
     tabletop: clouds of an object on a table, from depth images, and with foreign points
     tables: tables as Markdown and as text
+    view_study: picks before and after a second view
 """
