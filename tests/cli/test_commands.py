@@ -685,6 +685,27 @@ def test_pictures_of_an_evaluation(weights, real, tmp_path, monkeypatch):
     np.testing.assert_allclose(drawn[1], build_mug().mesh.bounds, atol=1e-4)
 
 
+@pytest.mark.slow
+def test_an_evaluation_of_depth_images_says_how_many_places_are_seen(weights, capsys, tmp_path):
+    words = ("--clouds", "camera1", "--clutter", "none", "outliers", "--stand", "tilt60", "--solver", "carry")
+    files = ("--json", tmp_path / "scores.json", "--card", tmp_path / "small.md")
+    run("evaluate", "--weights", weights, *EVALUATE, *words, "--no-reconstruct", *files)
+    record = json.loads((tmp_path / "scores.json").read_text())
+    settings = [(row["clouds"], row["clutter"], row["stand"]) for row in record["rows"]]
+    assert settings == [("camera1", "none", "tilt60"), ("camera1", "outliers", "tilt60")]
+    for row in record["rows"]:
+        assert sum(part["cases"] for part in row["by_sight"].values()) == 2 and row["iou"] is None
+        seen = [error["place_points"] >= 20 for error in row["errors"]]
+        assert row["by_sight"].get("seen", {"cases": 0})["cases"] == sum(seen)
+        assert all(error["confidence"] is None for error in row["errors"])  # of weights that are not calibrated
+    assert min(error["foreign"] for error in record["rows"][1]["errors"]) > 50
+    out, _ = capsys.readouterr()
+    assert "picks of tdf.imitate" in out and "camera1, outliers, tilt60" in out and "confidence < 0.5" in out
+    card = (tmp_path / "small.md").read_text()
+    assert "--clutter none outliers --stand tilt60 --solver carry" in card
+    assert "| one depth image, on a table; outliers; tilted within 60 degrees | small |" in card
+
+
 def test_every_condition_can_be_asked_for():
     from tdf_jax.cli.evaluate import Cloud, Clutter
     from tdf_jax.evaluation.cases import CLOUDS

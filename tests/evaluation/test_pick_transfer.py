@@ -17,6 +17,7 @@ from tdf_jax.evaluation.metrics import expected_trajectory, path_error, pose_err
 from tdf_jax.evaluation.pick_transfer import (
     BASELINES,
     compare,
+    imitated,
     overlaps,
     place_errors,
     random_weights,
@@ -237,3 +238,19 @@ def test_the_shipped_weights_transfer_a_pose_and_random_ones_do_not():
     assert encoded[0] > 0.7 and refined[0] > encoded[0] + 0.01
     distance, angle = place_errors(transferred(random_weights(model, 0), cases, config=config, progress=False), cases)
     assert ((distance > 0.02) | (angle > 20)).sum() >= 2
+
+
+@pytest.mark.slow
+def test_picks_of_imitate_are_those_of_the_library_and_its_confidence_is_kept():
+    mug_model, case = tdf.load_model("mug"), mug_case(3, 1)
+    (outcome,) = compare([case], mug_model, seed=4, progress=False, solver="carry", reconstruct=False)
+    estimates, confidences = imitated(mug_model, [case], seed=4, progress=False)
+    np.testing.assert_array_equal(outcome.estimates, estimates)
+    np.testing.assert_array_equal(outcome.confidence, confidences)
+    assert outcome.distance[0] < 0.02 and outcome.angle[0] < 20 and confidences[0] > 0.9
+    assert outcome.ious == {"iou": [None], "iou_refined": [None]}
+
+
+def test_an_unknown_solver_is_refused(pair, small_model):
+    with pytest.raises(InputError, match="solver is 'newton'"):
+        compare([pair], small_model, solver="newton")
