@@ -13,6 +13,7 @@ from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.geometry.symmetry import ROUND, about_z
 from tdf_jax.perception.clusters import separate_objects
 from tdf_jax.perception.depth import flying_pixels, points_from_depth
+from tdf_jax.perception.support import remove_plane
 
 if TYPE_CHECKING:
     import trimesh
@@ -149,7 +150,8 @@ def complete_cloud(
 def camera_cloud(table: Tabletop, clutter: str, rng: np.random.Generator) -> tuple[Float[np.ndarray, "all 3"], int]:
     """The cloud of an object from depth images, perhaps with foreign points of the same images.
 
-    The images become points by `points_from_depth`, and the table is removed by `separate_objects`. Of the clusters,
+    The images become points by `points_from_depth`, and the table is removed by `separate_objects`, of several images
+    by `remove_plane` in each of them. Of the clusters,
     the one with most of the object's points is taken. With clutter, its points of anything but the object are replaced.
 
     Args:
@@ -163,8 +165,9 @@ def camera_cloud(table: Tabletop, clutter: str, rng: np.random.Generator) -> tup
     Raises:
         InputError: no object is found in the images.
     """
-    points, labels = scene_points(images(table, rng))
-    cluster = segmented(table, points, labels)
+    views, labels = zip(*(image_points(image) for image in images(table, rng)))
+    points, labels = np.concatenate(views), np.concatenate(labels)
+    cluster = segmented(table, list(views), labels)
     own, rest = points[cluster & (labels == OWN)], points[cluster & (labels != OWN)]
     if clutter == CLEAN:
         return np.concatenate([own, rest]), len(own)
@@ -186,34 +189,40 @@ def images(table: Tabletop, rng: np.random.Generator) -> list[DepthImage]:
     return [depth_image(triangles, camera, rng) for camera in table.T_world_cameras]
 
 
-def scene_points(several: list[DepthImage]) -> tuple[Float[np.ndarray, "points 3"], Int[np.ndarray, " points"]]:
-    """Points of depth images, merged, (points, 3), metres, world frame; and the label of each, (points,)."""
-    points, labels = [], []
-    for image in several:
-        points.append(points_from_depth(image.depth, image.K, image.T_world_camera))
-        metres = np.where(image.depth > 0, image.depth, np.nan)
-        kept = (image.depth > 0) & ~flying_pixels(metres, image.K)  # in the order of `points_from_depth`
-        labels.append(image.labels[kept])
-    return np.concatenate(points), np.concatenate(labels)
+def image_points(image: DepthImage) -> tuple[Float[np.ndarray, "points 3"], Int[np.ndarray, " points"]]:
+    """Points of a depth image, (points, 3), metres, world frame; and the label of each, (points,)."""
+    points = points_from_depth(image.depth, image.K, image.T_world_camera)
+    metres = np.where(image.depth > 0, image.depth, np.nan)
+    kept = (image.depth > 0) & ~flying_pixels(metres, image.K)  # in the order of `points_from_depth`
+    return points, image.labels[kept]
 
 
 def segmented(
-    table: Tabletop, points: Float[np.ndarray, "points 3"], labels: np.ndarray
+    table: Tabletop, views: list[Float[np.ndarray, "_ 3"]], labels: Int[np.ndarray, " points"]
 ) -> Bool[np.ndarray, " points"]:
     """Which points of a scene are in the cluster that has most of the object's.
 
+    The table of several images is removed from each of them: a near camera's noise says nothing about a far one's.
+
     Args:
-        table: the object on the table.
-        points: points of the scene, (points, 3), metres, world frame.
-        labels: what they are of, (points,).
+        table: the object on the table, and the cameras.
+        views: points of the image of each camera, metres, world frame.
+        labels: what the points of all views are of, (points,).
 
     Raises:
         InputError: no object is found.
     """
     centre = moved(table.mesh.bounds.mean(axis=0)[None], table.T_world_object)[0, :2]
     half, below, above = WORKSPACE
-    box = (*(centre - half), -below, *(centre + half), above)
-    clusters = separate_objects(points, box, camera=table.T_world_cameras[0, :3, 3])
+    box = np.array([[*(centre - half), -below], [*(centre + half), above]])
+    positions = table.T_world_cameras[:, :3, 3]
+    if len(views) == 1:
+        clusters = separate_objects(views[0], box, camera=positions[0])
+    else:
+        within = [view[((view >= box[0]) & (view <= box[1])).all(axis=1)] for view in views]
+        above_table = [remove_plane(view, camera) for view, camera in zip(within, positions, strict=True)]
+        clusters = separate_objects(np.concatenate(above_table), plane=False)
+    points = np.concatenate(views)
     chosen = [_rows_of(points, cluster) for cluster in clusters]
     return max(chosen, key=lambda one: np.count_nonzero(labels[one] == OWN))
 

@@ -18,10 +18,10 @@ from tdf_jax.evaluation.tabletop import (
     SHARE,
     build_tabletop,
     complete_cloud,
+    image_points,
     images,
     moved,
     place_points,
-    scene_points,
     segmented,
     standing,
 )
@@ -88,11 +88,17 @@ def test_a_fifth_of_a_cluttered_cloud_is_foreign(clutter):
         assert ((far > 0.29) & (far < 1.01)).sum() == 50 and (far < 0.2).sum() == 50
 
 
-def test_depth_images_give_the_object_without_the_table():
+@pytest.mark.parametrize("count", [1, 2])
+def test_depth_images_give_the_object_without_the_table(count):
+    """Also where the second camera is farther, and has six times the noise of the first."""
+    distances = iter([0.4, 1.0])
     T = standing(BOX, "upright", generator(3))
-    scene = build_tabletop(BOX, T, 2, generator(3))
-    points, labels = scene_points(images(scene, generator(4)))
-    cluster = segmented(scene, points, labels)
+    scene = build_tabletop(BOX, T, count, generator(3))
+    for camera in scene.T_world_cameras:
+        camera[:3, 3] = T[:3, 3] - next(distances) * camera[:3, 2]
+    views, labels = zip(*(image_points(image) for image in images(scene, generator(4))))
+    points, labels = np.concatenate(views), np.concatenate(labels)
+    cluster = segmented(scene, list(views), labels)
     assert (labels[cluster] == OWN).mean() > 0.98
     assert cluster[labels == OWN].mean() > 0.95
     offset = np.abs(moved(points[cluster], np.linalg.inv(T))) - [0.03, 0.04, 0.05]
