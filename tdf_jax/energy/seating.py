@@ -2,6 +2,8 @@
 
 An occupancy of one half lies up to some millimetres off the surface, more at thin parts. The points of a cloud lie on
 the surface. So a point touches an object where its occupancy reaches that at the nearest points of the object's cloud.
+Few points of a target are on a thin peg, and none where a handle hangs on it. But they lie on a round bar, which tells
+where its surface is between them.
 """
 
 import jax.numpy as jnp
@@ -9,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tdf_jax.geometry import se3
+from tdf_jax.geometry.bars import bar_points, find_bars, in_bar
 from tdf_jax.geometry.sampling import subset
 from tdf_jax.networks.field import DescriptorField
 
@@ -54,21 +57,29 @@ def touch_distance(
 
     Returns:
         The displacement, metres: positive along the direction if there is a gap, negative if the two overlap, `MARGIN`
-            short of where the tested points touch; NaN if they do not touch, or overlap still, within `REACH`.
+            short of where the tested points touch, unless they are on a round bar of the target; NaN if they do not
+            touch, or overlap still, within `REACH`.
     """
     # In NumPy but for the fields: the number of points differs from call to call, and JAX would compile for each.
     R, t = np.asarray(se3.rotation(jnp.asarray(motion)), float), np.asarray(motion, float)[4:]
     direction, target_points = np.asarray(direction, float), np.asarray(target_points, float)
-    placed = np.asarray(points, float) @ R.T + t
-    near, target_near = _meeting(_denser(subset(placed, CLOUD)), _denser(subset(target_points, CLOUD)), direction)
+    placed = _denser(subset(np.asarray(points, float) @ R.T + t, CLOUD))
+    target_cloud = subset(target_points, CLOUD)
+    near, target_near = _meeting(placed, _denser(target_cloud), direction)
     if not len(near):
         return np.nan
+    target_near, bars = _split(target_cloud, target_near)
+    if len(bars):
+        # The margin is taken off in the end, but is not needed where points are as dense as on the bars.
+        near, target_near = _meeting(placed, np.concatenate([target_near, bars + MARGIN * direction]), direction)
+        if not len(near):
+            return np.nan
     steps = np.linspace(-REACH, REACH, 2 * STEPS + 1)
     shifts = steps[:, None, None] * direction
     cloud = subset(np.asarray(points, float), CLOUD)
     depths = [_depth(field, cloud, (target_near - shifts - t) @ R, OBJECT_LEVELS)]
     if target is not None:
-        depths.append(_depth(target, subset(target_points, CLOUD), near + shifts, TARGET_LEVELS))
+        depths.append(_depth(target, target_cloud, near + shifts, TARGET_LEVELS))
     return _first_touch(steps, np.max(depths, axis=0)) - MARGIN
 
 
@@ -104,6 +115,23 @@ def _denser(points: np.ndarray) -> np.ndarray:
     pairs = np.stack([np.repeat(nearest[:, 0], nearest.shape[1] - 1), nearest[:, 1:].ravel()], axis=1)
     one, other = np.unique(np.sort(pairs, axis=1), axis=0).T
     return np.concatenate([points, (points[one] + points[other]) / 2])
+
+
+def _split(cloud: Float[np.ndarray, "points 3"], near: Float[np.ndarray, "near 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """The denser cloud without its round bars, and points all over these; `near` and none if it has none there.
+
+    Args:
+        cloud: cloud of the target.
+        near: points of its denser cloud that may meet the object; bars that go through none of them do not count.
+    """
+    from scipy.spatial import KDTree
+
+    bars = find_bars(cloud, np.flatnonzero(KDTree(near).query(cloud)[0] == 0))
+    if not bars:
+        return near, np.empty((0, 3))
+    denser = _denser(cloud)
+    replaced = np.any([in_bar(bar, denser) for bar in bars], axis=0)
+    return denser[~replaced], np.concatenate([bar_points(bar, cloud) for bar in bars])
 
 
 def _meeting(points, target_points, direction) -> tuple[np.ndarray, np.ndarray]:

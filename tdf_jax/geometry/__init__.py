@@ -1,6 +1,7 @@
 """Poses, trajectories and shapes as numbers; no network.
 
 Modules:
+    bars: round bars in a cloud, such as pegs
     demonstration: one trajectory shown on one object
     distance_fields: signed distances of boxes, meshes and clouds, as obstacles
     grid: regular grids along a line, in a plane or in a volume

@@ -87,3 +87,16 @@ def test_points_in_the_object_are_counted_where_no_height_frees_it():
     assert overlap(BALL, wall + [2 * RADIUS, 0.0, 0.0], np.eye(4), DOWN) == 0
     below = np.stack([np.zeros(50), np.zeros(50), np.full(50, -RADIUS + 0.004)], axis=1)  # free once it is raised
     assert overlap(BALL, below, np.eye(4), DOWN) == 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_few_points_on_a_peg_tell_where_it_is_touched(seed):
+    """The ball rests on the line on top of a peg, from which all points of the cloud are some millimetres away."""
+    rng = np.random.default_rng(seed)
+    angles = rng.uniform(0.3, 2 * np.pi - 0.3, 28)
+    peg = np.stack([0.004 * np.sin(angles), rng.uniform(-0.04, 0.04, 28), 0.004 * np.cos(angles) - 0.004], axis=1)
+    found = touch_distance(BALL, None, sphere(), peg, raised(0.003), DOWN)
+    assert abs(found - 0.003) < 3e-4
+    # Noise hides the peg, and the ball is lowered until the tested points touch, as everywhere else.
+    noisy = touch_distance(BALL, None, sphere(), peg + rng.normal(0, 0.001, peg.shape), raised(0.003), DOWN)
+    assert 3e-4 < abs(noisy - 0.003) < 0.004
