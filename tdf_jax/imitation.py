@@ -19,7 +19,7 @@ from tdf_jax.energy.reference import Reference
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.model import Model
-from tdf_jax.relation import Objects, carry_object, check_scene, reference_of, target_field
+from tdf_jax.relation import Objects, carry_object, check_scene, kept_points, reference_of, target_field
 from tdf_jax.solvers.adam import OptimizeConfig, optimize
 from tdf_jax.solvers.initial import default_goal
 from tdf_jax.solvers.multistart import SolveConfig, solve
@@ -43,6 +43,7 @@ def imitate(
     goal_offset: Float[Array | np.ndarray, "3"] | Sequence[float] | None = None,
     fix_last: bool = True,
     seat: bool = True,
+    clean: bool = True,
     energy: EnergyWeights | None = None,
     config: CarryConfig | SolveConfig | OptimizeConfig = CarryConfig(),
     progress: Callable | None = None,
@@ -73,6 +74,7 @@ def imitate(
             demonstration is carried rigidly with the pick; with the other configs all poses are free, and a goal is
             where the pose at the release starts.
         seat: with a target, lower or raise the placed object until it touches the target; see `relate`.
+        clean: remove foreign points from both clouds, such as of the table, see `encode`; the result counts them.
         energy: weights of the terms of eq. 3, by default the paper's; only with a `config` that minimises it.
         config: settings of `carry`, of `solve`, or, for Adam as in the paper and for energies with eq. 6, of
             `optimize`.
@@ -87,6 +89,7 @@ def imitate(
 
     Warns:
         CategoryWarning: the object, or the target, is probably of another category than the demonstration's.
+        ForeignPointsWarning: see `encode`.
         ConfidenceWarning: the pick is probably wrong. Both are known for shipped weights and the default config.
         SizeWarning: see `encode`.
     """
@@ -100,6 +103,7 @@ def imitate(
         )
     checks.boolean("imitate()", "fix_last", fix_last)
     checks.boolean("imitate()", "seat", seat)
+    checks.boolean("imitate()", "clean", clean)
     cloud = _merged(points)
     reference = reference_of("imitate()", model, demonstration, target_points, target_model)
     if reference.contact is not None:
@@ -110,16 +114,20 @@ def imitate(
                 f"imitate(): {contradicting or 'config is ' + type(config).__name__}, and the demonstration has a "
                 "target, which gives the goal; expected no goal and a CarryConfig. Drop one of them"
             )
-    field = encode(model, cloud)
+    field, kept = encode(model, cloud, clean=clean, return_kept=True)
+    foreign, cloud = np.asarray(np.count_nonzero(~kept), np.int32), kept_points(cloud, kept)
     if reference.contact is not None:
-        objects = Objects(cloud, target_points, field, target_field(model, reference, target_points, target_model))
-        check_scene("imitate()", cloud, target_points, reference)
+        target, placed = target_field(model, reference, target_points, target_model, clean)
+        objects = Objects(cloud, placed, field, target)
+        check_scene("imitate()", cloud, placed, reference)
         search = {"config": config, "seat": seat, "progress": progress, "device_mesh": device_mesh}
         result = carry_object(objects, reference, key, **search)
         if target_points is not None:
             weights = (model if target_model is None else target_model).info.name
-            warn_of_target("imitate()", float(result.target_residual), weights, objects.target, target_points)
-        return _judged(result, model.info.name, field, cloud)
+            warn_of_target("imitate()", float(result.target_residual), weights, target, placed)
+            foreign_of_target = np.asarray(len(target_points) - len(placed), np.int32)
+            result = dataclasses.replace(result, target_foreign_points=foreign_of_target)
+        return dataclasses.replace(_judged(result, model.info.name, field, cloud), foreign_points=foreign)
     goal = None if goal is None else jnp.asarray(checks.pose("imitate()", "goal", goal), float)
     if goal_offset is not None:
         goal = default_goal(field, reference) if goal is None else goal
@@ -127,11 +135,13 @@ def imitate(
     settings = {"goal": goal, "fix_last": fix_last, "progress": progress, "device_mesh": device_mesh}
     if isinstance(config, CarryConfig):
         result = carry(field, reference, key, config=config, **settings)
-        return _judged(result, model.info.name, field, cloud)
+        return dataclasses.replace(_judged(result, model.info.name, field, cloud), foreign_points=foreign)
     weights = EnergyWeights() if energy is None else energy
     if isinstance(config, OptimizeConfig):
-        return optimize(field, reference, key, energy=weights, config=config, **settings)
-    return solve(field, reference, key, energy=weights, config=config, **settings)
+        result = optimize(field, reference, key, energy=weights, config=config, **settings)
+    else:
+        result = solve(field, reference, key, energy=weights, config=config, **settings)
+    return dataclasses.replace(result, foreign_points=foreign)
 
 
 def _merged(points) -> Any:

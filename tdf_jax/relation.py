@@ -8,11 +8,12 @@ M = A_t D inverse(A_o).
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import host
@@ -107,6 +108,7 @@ def relate(
     target_model: Model | None = None,
     key: PRNGKeyArray,
     seat: bool = True,
+    clean: bool = True,
     config: CarryConfig = CarryConfig(),
 ) -> Float[Array, "7"]:
     """Find the motion that places a new object on a new target as in a demonstration, without a pick.
@@ -123,6 +125,7 @@ def relate(
         key: random key; the result is a function of it.
         seat: lower or raise the object by up to 1.5 cm until it touches the target, if the demonstrated object touched
             its target from above; see `tdf_jax.energy.seating`.
+        clean: remove foreign points from both clouds, see `encode`.
         config: settings of the search on both objects.
 
     Returns:
@@ -141,12 +144,14 @@ def relate(
     checks.boolean("relate()", "seat", seat)
     if not isinstance(config, CarryConfig):
         raise InputError(f"relate(): config is {config!r}; expected a CarryConfig")
-    field = target_field(model, reference, target_points, target_model)
-    objects = Objects(points, target_points, encode(model, points), field)
+    checks.boolean("relate()", "clean", clean)
+    target, placed = target_field(model, reference, target_points, target_model, clean)
+    field, kept = encode(model, points, clean=clean, return_kept=True)
+    objects = Objects(kept_points(points, kept), placed, field, target)
     check_scene("relate()", points, target_points, reference)  # after `encode`, which refuses what is no cloud
     found = find_relations("relate()", objects, reference, key, config, seat)
     weights = (model if target_model is None else target_model).info.name
-    warn_of_target("relate()", found.target_residual, weights, field, target_points)
+    warn_of_target("relate()", found.target_residual, weights, target, placed)
     return found.motions[0]
 
 
@@ -185,9 +190,9 @@ def reference_of(function: str, model: Model, demonstration, target_points, targ
 
 
 def target_field(
-    model: Model, reference: Reference, target_points, target_model: Model | None
-) -> DescriptorField | None:
-    """Field of the target.
+    model: Model, reference: Reference, target_points, target_model: Model | None, clean: bool
+) -> tuple[DescriptorField | None, Any]:
+    """Field of the target, and its points.
 
     Args:
         model: network of the object.
@@ -195,15 +200,29 @@ def target_field(
         target_points: point cloud of the new target, (points, 3), metres, world frame; None if the demonstrated one has
             not moved.
         target_model: network of the target; by default `model` for a new target.
+        clean: remove foreign points, see `encode`.
 
     Returns:
-        The field; None if the demonstrated target has not moved and there is no network for it.
+        The field; None if the demonstrated target has not moved and there is no network for it. The points of the new
+            target that were kept, (kept, 3), metres, world frame; None if the demonstrated one has not moved.
     """
     if target_points is not None:
-        return encode(model if target_model is None else target_model, target_points)
+        side = model if target_model is None else target_model
+        field, kept = encode(side, target_points, clean=clean, return_kept=True)
+        return field, kept_points(target_points, kept)
     if target_model is None or reference.contact is None:
-        return None
-    return encode(target_model, reference.contact.target_points)
+        return None, None
+    return encode(target_model, reference.contact.target_points, clean=clean), None
+
+
+def kept_points(points, kept: Bool[np.ndarray, " points"]) -> Any:
+    """The points of a cloud that were kept; the cloud as it was given if all were.
+
+    Args:
+        points: point cloud, (points, 3), metres.
+        kept: mask from `encode`, (points,).
+    """
+    return points if kept.all() else np.asarray(points)[kept]
 
 
 def check_scene(function: str, points, target_points, reference: Reference) -> None:

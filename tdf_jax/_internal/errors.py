@@ -17,6 +17,10 @@ class ConfidenceWarning(TdfWarning):
     """Issued if a pick is probably wrong."""
 
 
+class ForeignPointsWarning(TdfWarning):
+    """Issued if so many points of a cloud look foreign to its object that none of them is removed."""
+
+
 class SizeWarning(TdfWarning):
     """Issued if an object is far smaller or larger than those that the network was trained on."""
 

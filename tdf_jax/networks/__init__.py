@@ -4,6 +4,7 @@ Modules:
     checkpoint: weights on disk (safetensors)
     encoding: point cloud -> field
     field: the descriptor field of one object
+    foreign: points of a cloud that are not of its object
     model: parameters, sizes and origin of a network
     ndf_checkpoint: converter of published PyTorch checkpoints
     occupancy: the network: encoder, decoder, configuration

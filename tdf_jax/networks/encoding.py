@@ -2,6 +2,7 @@
 
 import functools
 import warnings
+from typing import Any, Literal, overload
 
 import jax
 import jax.numpy as jnp
@@ -11,11 +12,12 @@ from jaxtyping import Array, Bool, Float, Real
 from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import public
 from tdf_jax._internal.deprecation import caller_level, renamed_keywords
-from tdf_jax._internal.errors import InputError, SizeWarning
+from tdf_jax._internal.errors import ForeignPointsWarning, InputError, SizeWarning
 from tdf_jax._internal.precision import full_precision
 from tdf_jax._internal.units import CENTIMETRES, INCHES, MILLIMETRES
 from tdf_jax.geometry import sampling
 from tdf_jax.networks.field import DescriptorField
+from tdf_jax.networks.foreign import MOST, find_foreign, remote_points
 from tdf_jax.networks.model import Model, ModelInfo
 from tdf_jax.networks.occupancy import condition, encode_latent
 
@@ -29,14 +31,39 @@ SAME_SIDE = np.pi / 6
 # another bounding box; a wrong unit is a factor of 39 or more.
 SIZE_TOLERANCE = 3.0
 # With inches, because the size of the training objects distinguishes them from centimetres.
+# Points of a cloud that is judged by its field; fewer do not say how good the field is.
+LEAST_JUDGED = 100
 PROBABLE_UNITS = (MILLIMETRES, CENTIMETRES, INCHES)
 
 
+@overload
+def encode(
+    model: Model,
+    points: Real[Array | np.ndarray, "points 3"],
+    num_subsamples: int = NUM_SUBSAMPLES,
+    *,
+    clean: bool = True,
+    return_kept: Literal[False] = False,
+) -> DescriptorField: ...
+@overload
+def encode(
+    model: Model,
+    points: Real[Array | np.ndarray, "points 3"],
+    num_subsamples: int = NUM_SUBSAMPLES,
+    *,
+    clean: bool = True,
+    return_kept: Literal[True],
+) -> tuple[DescriptorField, Bool[np.ndarray, " points"]]: ...
 @public
 @renamed_keywords(thinnings="num_subsamples")
 def encode(
-    model: Model, points: Real[Array | np.ndarray, "points 3"], num_subsamples: int = NUM_SUBSAMPLES
-) -> DescriptorField:
+    model: Model,
+    points: Real[Array | np.ndarray, "points 3"],
+    num_subsamples: int = NUM_SUBSAMPLES,
+    *,
+    clean: bool = True,
+    return_kept: bool = False,
+) -> Any:
     """Encode an object's point cloud into its descriptor field.
 
     A network expects clouds of the density that it was trained on (`model.info.cloud_points`). `encode` therefore takes
@@ -44,15 +71,21 @@ def encode(
     latents. It uses all points of a cloud that is no denser, and of every cloud if the density is unknown, as for
     converted weights. docs/guide/training.md has the measurements.
 
+    Foreign points are removed first, if they are at most 30 % of the cloud: points far from all else, and, with weights
+    that know the density and the size of their training clouds, points that do not fit the field of the others. The
+    field of a cloud without any is the same to the last bit as with `clean=False`. docs/guide/camera.md has examples.
+
     Args:
         model: network.
         points: point cloud of the object, (points, 3), metres, world frame; at least 21 points.
         num_subsamples: farthest-point subsamples to average, see `sampling.subsamples`; 0 uses all points.
+        clean: remove foreign points. Points that are traced by `jax.jit` are taken as they are.
+        return_kept: also return which points were kept.
 
     Returns:
-        The field, in the world frame. It rotates and translates with the points, except for ties that rounding decides:
-        in farthest-point sampling, and, if the network has a symmetry-breaking offset, in which point is the farthest
-        from the centroid.
+        The field, in the world frame; with `return_kept`, and a mask of the points that were kept, (points,). The field
+            rotates and translates with the points, except for ties that rounding decides: in farthest-point sampling,
+            and, if the network has a symmetry-breaking offset, in which point is the farthest from the centroid.
 
     Raises:
         InputError: the points are fewer than 21 or than the network's neighbours, not (points, 3), not finite, all
@@ -60,29 +93,84 @@ def encode(
             the points are denser than the network's and traced by `jax.jit`.
 
     Warns:
+        ForeignPointsWarning: more than 30 % of the points look foreign; they are not removed.
         SizeWarning: the cloud is far smaller or larger than the objects that the network was trained on.
     """
     if not isinstance(model, Model):
         raise InputError(f"encode(): model is {model!r}; expected a Model, such as tdf.load_model('mug')")
     cloud, density = checks.points("encode()", points), model.info.cloud_points
     num_subsamples = checks.count("encode()", "num_subsamples", num_subsamples, 0)
+    checks.boolean("encode()", "clean", clean)
+    checks.boolean("encode()", "return_kept", return_kept)
     if len(cloud) < model.config.neighbours:
         raise InputError(
             f"encode(): there are {len(cloud)} points; expected at least the network's "
             f"{model.config.neighbours} neighbours"
         )
-    plain, traced = num_subsamples == 0 or density is None, checks.traced(cloud)
+    if checks.traced(cloud):
+        if num_subsamples and density is not None and len(cloud) > density:
+            raise InputError(
+                f"encode(): {len(cloud)} points cannot be subsampled to {density} under jax.jit; expected that many. "
+                "Subsample the cloud outside with tdf.thin, or pass num_subsamples=0"
+            )
+        field = _average(model.params, model.config, cloud[None], _anchor(cloud), jnp.zeros_like(cloud[0]))
+        return (field, np.ones(len(cloud), bool)) if return_kept else field
+    cloud = np.asarray(cloud)
+    checks.near("encode()", "points", cloud)
+    kept = _gathered(cloud, model.config.neighbours) if clean else np.ones(len(cloud), bool)
+    cloud = cloud[kept]
+    _warn_of_size(model.info, cloud)
+    field = _field(model, cloud, num_subsamples, num_subsamples)
+    if clean and _judges(model, cloud):
+        fitting = find_foreign(
+            field,
+            cloud.astype(np.float64),
+            # One subsample is enough to compare parts; it runs the same program.
+            lambda part, exact: _field(model, cloud[part], num_subsamples if exact else 1, num_subsamples),
+        )
+        if fitting.field is not None:
+            field, kept[kept] = fitting.field, fitting.kept
+        elif not fitting.kept.all():
+            _warn_of_foreign(int((~fitting.kept).sum()), len(cloud))
+    return (field, kept) if return_kept else field
+
+
+def _gathered(cloud, least: int) -> Bool[np.ndarray, " points"]:
+    """Mask of the points that are not far from all else; of all if they would be too many."""
+    remote = remote_points(cloud.astype(np.float64))
+    number = int(remote.sum())
+    if number > MOST * len(cloud) or len(cloud) - number < max(least, checks.MINIMUM_POINTS):
+        _warn_of_foreign(number, len(cloud))
+        return np.ones(len(cloud), bool)
+    return ~remote
+
+
+def _judges(model: Model, cloud) -> bool:
+    """Whether a network's fields say which points are foreign: it was trained as `tdf train` does, on such sizes."""
+    info = model.info
+    if None in (info.cloud_points, info.smallest_diagonal, info.largest_diagonal) or checks.traced(model.params):
+        return False
+    diagonal = float(np.linalg.norm(np.ptp(cloud.astype(np.float64), axis=0)))
+    least, most = _sizes(info)
+    return len(cloud) >= LEAST_JUDGED and least <= diagonal <= most
+
+
+def _warn_of_foreign(number: int, count: int) -> None:
+    warnings.warn(
+        f"encode(): {number} of {count} points look as if they were not of the object, which is more than {MOST:.0%}; "
+        "none of them is removed. Pass the cloud of one object, see tdf.separate_objects",
+        ForeignPointsWarning,
+        stacklevel=caller_level(),
+    )
+
+
+def _field(model: Model, cloud: np.ndarray, num_subsamples: int, slots: int) -> DescriptorField:
+    """The field of a cloud as it is; `slots` is the number of subsamples that the program has room for."""
+    density = model.info.cloud_points
+    plain = num_subsamples == 0 or density is None
     count = len(cloud) if num_subsamples == 0 or density is None else density
     dense = len(cloud) > count
-    if traced and dense:
-        raise InputError(
-            f"encode(): {len(cloud)} points cannot be subsampled to {count} under jax.jit; expected that many. "
-            "Subsample the cloud outside with tdf.thin, or pass num_subsamples=0"
-        )
-    if traced:
-        return _average(model.params, model.config, cloud[None], _anchor(cloud), jnp.zeros_like(cloud[0]))
-    whole, shift = _centred(np.asarray(cloud))
-    _warn_of_size(model.info, whole)
+    whole, shift = _centred(cloud)
     # All subsamples share one anchor, so that they see the same side of a symmetric object as its front.
     anchor = _anchor(whole)
     clouds = sampling.subsamples(whole, count, num_subsamples) if dense else whole[None]
@@ -90,14 +178,13 @@ def encode(
         return _average(model.params, model.config, clouds, anchor, shift)
     num_clouds, size = clouds.shape[:2]
     # Padding with clouds and points that do not count lets clouds of many sizes run one program.
-    padded = (1, -(-size // PADDING) * PADDING) if plain else (num_subsamples, count)
+    padded = (1, -(-size // PADDING) * PADDING) if plain else (slots, count)
     clouds = np.resize(clouds, (*padded, 3))
     return _encode(model.params, model.config, clouds, np.int32(num_clouds), np.int32(size), anchor, shift)
 
 
 def _centred(cloud):
     """The cloud relative to its mean, and the mean; the difference is taken in float64, before any rounding."""
-    checks.near("encode()", "points", cloud)
     dtype = np.promote_types(jax.dtypes.canonicalize_dtype(cloud.dtype), np.float32)
     shift = cloud.mean(axis=0, dtype=np.float64)
     # See `_latent`: a cloud that counts as centred stays as it is.
@@ -110,12 +197,18 @@ def _anchor(cloud):
     return cloud[((cloud - cloud.mean(axis=0)) ** 2).sum(axis=1).argmax()]
 
 
+def _sizes(info: ModelInfo) -> tuple[float, float]:
+    """Diagonals between which a cloud's unit is not in doubt, metres; the network's sizes are known."""
+    assert info.smallest_diagonal is not None and info.largest_diagonal is not None
+    return info.smallest_diagonal / SIZE_TOLERANCE, info.largest_diagonal * SIZE_TOLERANCE
+
+
 def _warn_of_size(info: ModelInfo, cloud: np.ndarray) -> None:
     """Warn if a cloud is so small or so large that its unit is probably wrong."""
     if info.smallest_diagonal is None or info.largest_diagonal is None:
         return
-    diagonal = float(np.linalg.norm(np.ptp(cloud, axis=0)))
-    least, most = info.smallest_diagonal / SIZE_TOLERANCE, info.largest_diagonal * SIZE_TOLERANCE
+    diagonal = float(np.linalg.norm(np.ptp(cloud.astype(np.float64), axis=0)))
+    least, most = _sizes(info)
     if least <= diagonal <= most:
         return
     # Centimetres and inches differ by less than the range of sizes: the unit that fits it best is the likely one.

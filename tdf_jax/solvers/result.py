@@ -26,6 +26,10 @@ def _no_seatings() -> np.ndarray:
     return np.zeros((0, 3), np.float32)
 
 
+def _none() -> np.ndarray:
+    return np.zeros((), np.int32)
+
+
 def _unknown() -> np.ndarray:
     return np.full((), np.nan, np.float32)
 
@@ -46,6 +50,8 @@ def _unknown() -> np.ndarray:
         "target_residual",
         "target_confidence",
         "seatings",
+        "foreign_points",
+        "target_foreign_points",
     ],
     meta_fields=["grasp", "release"],
 )
@@ -83,6 +89,9 @@ class Result:
             calibrated.
         seatings: displacement of the placed object by which it touches its target, world frame, (candidates, 3),
             metres; NaN where it was not seated, see `imitate`. No candidates unless the demonstration has a target.
+        foreign_points: number of points of the object's cloud that were removed because they are not of the object, see
+            `encode`; a scalar, set by `imitate`.
+        target_foreign_points: the same for the new target's cloud.
         grasp: index of the pose at which the object is grasped; poses before it are the approach.
         release: index of the pose at which it is released, from the end: -1 unless there is a retreat.
     """
@@ -101,6 +110,8 @@ class Result:
     target_residual: Float[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_unknown)
     target_confidence: Float[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_unknown)
     seatings: Float[Array | np.ndarray, "*batch targets 3"] = dataclasses.field(default_factory=_no_seatings)
+    foreign_points: Int[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_none)
+    target_foreign_points: Int[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_none)
     grasp: int = 0
     release: int = -1
 
@@ -211,6 +222,10 @@ class Result:
             "poses": f"{np.shape(self.trajectories)[-2]}",
             "status": self.status,
         }
+        removed = {"object": int(self.foreign_points), "target": int(self.target_foreign_points)}
+        if any(removed.values()):
+            words = ", ".join(f"{number} of the {name}'s cloud" for name, number in removed.items() if number)
+            rows["foreign points"] = f"removed {words}"
         if not np.asarray(self.finite).any():
             return rows
         pick = np.asarray(self.picks)[self.best]
