@@ -276,6 +276,7 @@ def _errors(outcome: Outcome) -> list[dict]:
             "confidence": None if np.isnan(outcome.confidence[index]) else float(outcome.confidence[index]),
             "place_points": case.seen,
             "foreign": None if case.own is None else len(case.points_b) - case.own,
+            "removed": None if outcome.removed is None else int(outcome.removed[index]),
         }
         for index, case in enumerate(outcome.cases)
     ]

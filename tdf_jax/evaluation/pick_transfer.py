@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from tqdm import tqdm
 
 from tdf_jax._internal import checks
-from tdf_jax._internal.errors import CategoryWarning, ConfidenceWarning, InputError
+from tdf_jax._internal.errors import CategoryWarning, ConfidenceWarning, ForeignPointsWarning, InputError
 from tdf_jax.energy.descriptors import pose_descriptor
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference
@@ -73,7 +73,7 @@ def transferred(
 
 def imitated(
     model: Model, cases: Sequence[Transfer], *, seed: int = 0, progress: bool = True
-) -> tuple[Float[np.ndarray, "cases 7"], Float[np.ndarray, " cases"]]:
+) -> tuple[Float[np.ndarray, "cases 7"], Float[np.ndarray, " cases"], Int[np.ndarray, " cases"]]:
     """Transfer the pose at the place in every case by `imitate`, with its default settings.
 
     Args:
@@ -83,20 +83,21 @@ def imitated(
         progress: show a progress bar.
 
     Returns:
-        Estimated poses `wxyz_xyz` of the place on object b, (cases, 7), world frame; and `result.confidence`, (cases,),
-        NaN with weights for which it is not calibrated.
+        Estimated poses `wxyz_xyz` of the place on object b, (cases, 7), world frame; `result.confidence`, (cases,), NaN
+        with weights for which it is not calibrated; and the number of foreign points that were removed, (cases,).
     """
     query_key, start_key = jax.random.split(jax.random.key(seed))
-    estimates, confidences = [], []
+    estimates, confidences, removed = [], [], []
     for index, case in enumerate(tqdm(cases, desc="imitating", disable=not progress)):
         reference = place_reference(model, case, box_query(query_key, count=QUERIES, size=QUERY_SIZE * case.scale))
-        with warnings.catch_warnings():  # the table counts the doubtful picks
-            warnings.simplefilter("ignore", CategoryWarning)
-            warnings.simplefilter("ignore", ConfidenceWarning)
+        with warnings.catch_warnings():  # the record has the numbers
+            for kind in (CategoryWarning, ConfidenceWarning, ForeignPointsWarning):
+                warnings.simplefilter("ignore", kind)
             result = imitate(model, reference, case.points_b, key=jax.random.fold_in(start_key, index), fix_last=False)
         estimates.append(np.asarray(result.trajectory.wxyz_xyz[0]))
         confidences.append(float(result.confidence))
-    return np.stack(estimates), np.array(confidences)
+        removed.append(int(result.foreign_points))
+    return np.stack(estimates), np.array(confidences), np.array(removed)
 
 
 def place_errors(
@@ -203,6 +204,7 @@ class Outcome:
         ious: reconstruction overlaps, see `overlaps`.
         summary: statistics of the errors, see `summary`.
         confidence: `result.confidence`, (cases,); NaN where it is not calibrated, and with other solvers than `carry`.
+        removed: number of points that were removed from each cloud as foreign, (cases,); None with other solvers.
     """
 
     method: str
@@ -213,6 +215,7 @@ class Outcome:
     ious: Mapping[str, Sequence[float | None]]
     summary: dict
     confidence: Float[np.ndarray, " cases"]
+    removed: Int[np.ndarray, " cases"] | None
 
 
 def compare(
@@ -249,16 +252,16 @@ def compare(
     def found(network):
         if solver == CARRY:
             return imitated(network, cases, seed=seed, progress=progress)
-        return transferred(network, cases, seed=seed, config=config, progress=progress), None
+        return transferred(network, cases, seed=seed, config=config, progress=progress), None, None
 
     ious = overlaps(model, cases) if reconstruct else no_overlaps(cases)
     outcomes = [_outcome(model.info.name, cases, *found(model), ious, seed)]
     for method in baselines:
         if method == UNTRAINED:
-            estimates, _ = found(random_weights(model, seed))
+            estimates = found(random_weights(model, seed))[0]
         else:
             estimates = aligned(method, cases, seed=seed, num_starts=config.num_starts, progress=progress)
-        outcomes.append(_outcome(method, cases, estimates, None, no_overlaps(cases), seed))
+        outcomes.append(_outcome(method, cases, estimates, None, None, no_overlaps(cases), seed))
     return outcomes
 
 
@@ -353,11 +356,11 @@ def _by_sight(distance, angle, cases, seed, confidence) -> dict:
     return parts
 
 
-def _outcome(method, cases, estimates, confidence, ious, seed) -> Outcome:
+def _outcome(method, cases, estimates, confidence, removed, ious, seed) -> Outcome:
     distance, angle = place_errors(estimates, cases)
     row = summary(distance, angle, ious, cases, seed, tilts(estimates, cases), confidence)
     known = np.full(len(cases), np.nan) if confidence is None else confidence
-    return Outcome(method, cases, estimates, distance, angle, ious, row, known)
+    return Outcome(method, cases, estimates, distance, angle, ious, row, known, removed)
 
 
 def _overlap(estimate, truth):

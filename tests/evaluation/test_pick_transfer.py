@@ -244,9 +244,10 @@ def test_the_shipped_weights_transfer_a_pose_and_random_ones_do_not():
 def test_picks_of_imitate_are_those_of_the_library_and_its_confidence_is_kept():
     mug_model, case = tdf.load_model("mug"), mug_case(3, 1)
     (outcome,) = compare([case], mug_model, seed=4, progress=False, solver="carry", reconstruct=False)
-    estimates, confidences = imitated(mug_model, [case], seed=4, progress=False)
+    estimates, confidences, removed = imitated(mug_model, [case], seed=4, progress=False)
     np.testing.assert_array_equal(outcome.estimates, estimates)
     np.testing.assert_array_equal(outcome.confidence, confidences)
+    assert outcome.removed.tolist() == removed.tolist() == [0]
     assert outcome.distance[0] < 0.02 and outcome.angle[0] < 20 and confidences[0] > 0.9
     assert outcome.ious == {"iou": [None], "iou_refined": [None]}
 
