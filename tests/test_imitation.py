@@ -51,6 +51,16 @@ def test_several_views_are_merged(imitate, reference, result):
         imitate(reference, points=[TARGET, TARGET[:5, :2]])
 
 
+@pytest.mark.parametrize("config", [CONFIG, CARRY])
+def test_foreign_points_are_counted_and_change_nothing_else(imitate, reference, config):
+    points = np.insert(TARGET, 7, [0.2, 3.0, -0.1], axis=0)
+    found, expected = imitate(reference, points, config=config), imitate(reference, config=config)
+    assert (found.foreign_points, expected.foreign_points) == (1, 0)
+    assert_equal(dataclasses.replace(found, foreign_points=expected.foreign_points), expected)
+    left = imitate(reference, points, config=config, clean=False)
+    assert left.foreign_points == 0 and np.abs(left.pick - expected.pick).max() > 1e-3
+
+
 def test_several_demonstrations(imitate, small_model, demonstration, result):
     other = dataclasses.replace(demonstration, points=random_cloud(7).astype(np.float32))
     both = imitate([demonstration, other])

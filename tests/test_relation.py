@@ -198,6 +198,23 @@ def test_a_shared_reference_gives_the_same(small_model, related, moved, result):
         tdf.imitate(small_model, plain, moved[0], target_points=moved[1], key=KEY, config=SEARCH)
 
 
+def test_foreign_points_of_both_clouds_change_nothing(small_model, related, moved, result):
+    points, target = (np.insert(cloud, 5, [3.0, -2.0, 1.0], axis=0) for cloud in moved[:2])
+    found = tdf.imitate(small_model, related, points, target_points=target, key=KEY, config=SEARCH)
+    assert (found.foreign_points, found.target_foreign_points) == (1, 1)
+    assert (result.foreign_points, result.target_foreign_points) == (0, 0)
+    np.testing.assert_array_equal(found.trajectories, result.trajectories)
+    np.testing.assert_array_equal(found.target_residual, result.target_residual)
+    options = {"key": KEY, "config": SEARCH}
+    motions = [
+        tdf.relate(small_model, related, points=points, target_points=target, **options),
+        tdf.relate(small_model, related, points=moved[0], target_points=moved[1], clean=False, **options),
+        tdf.relate(small_model, related, points=points, target_points=target, clean=False, **options),
+    ]
+    np.testing.assert_array_equal(motions[0], motions[1])
+    assert np.abs(motions[2] - motions[1]).max() > 1e-3
+
+
 def test_a_batch_shares_the_target(small_model, related, moved, result):
     options = {"target_points": moved[1], "config": SEARCH}
     (one,) = tdf.imitate_batch(small_model, related, [moved[0]], key=KEY, **options)

@@ -101,6 +101,7 @@ def _run(settings: Settings, folder: Path, pictures: Pictures) -> dict:
             target_model=target_model,
             key=start_key,
             goal_offset=None if offset is None else np.array(offset),
+            clean=settings.clean,
             energy=energy,
             config=config,
             progress=progress,
@@ -272,6 +273,7 @@ def _record(
             "queries": len(demonstration.query),
         },
         "target": {"points": len(scene.points), "T_world_target": scene.T_world_target.tolist()},
+        "foreign_points": {"object": int(result.foreign_points), "target": int(result.target_foreign_points)},
         **({} if camera is None else {"camera": camera}),
         "status": result.status,
         "best": result.best,
@@ -334,6 +336,9 @@ def _table(record: dict, out: Path) -> str:
         rows["object"] = f"{taken['points']} points of the depth images, 1 of {len(clusters)} objects"
         if frame == "camera":
             rows["frame"] = "that of the camera, because there is no --camera-pose"
+    foreign = [f"{number} of the {name}'s cloud" for name, number in record["foreign_points"].items() if number]
+    if foreign:
+        rows["foreign points"] = f"removed {', '.join(foreign)}"
     if record["modes"] is not None:
         rows["solutions"] = _solutions(record["modes"])
     if record["recognised"] is not None:

@@ -96,6 +96,7 @@ class Settings(SceneSettings):
         workspace: box that the objects are in, metres, world frame.
         depth_scale: metres per unit of the depth images, such as 0.001 for millimetres.
         clusters: say which objects the depth images show, and which was taken.
+        clean: remove foreign points, such as of the table, from the clouds of the object and the target.
         goal_offset: translation that is added to the goal, metres, world frame.
         target_object: mesh or point cloud of the object that the new one is placed on or in, in the unit of --target;
             the demonstration file must have one too. Without it the demonstrated one has not moved.
@@ -121,6 +122,7 @@ class Settings(SceneSettings):
     ] = None
     depth_scale: Annotated[float | None, _option("FLOAT", "1; whole numbers need it")] = None
     clusters: bool = False
+    clean: bool = True
     goal_offset: Annotated[tuple[float, float, float], _option("X Y Z")] = (0.0, 0.0, 0.0)
     target_object: Annotated[Path | None, _option("FILE", "none")] = None
     target_weights: Annotated[str | None, _option("NAME|FILE", "those of --weights, or of the category")] = None

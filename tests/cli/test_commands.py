@@ -138,8 +138,9 @@ def test_the_record_tells_all_settings(folder, weights):
         "iterations": 3, "points": 60,
         "seed": 0, "weights": str(weights), "out": str(folder), "no_plots": False, "json": False,
         "depth": None, "intrinsics": None, "camera_pose": None, "mask": None, "workspace": None, "depth_scale": None,
-        "clusters": False,
+        "clusters": False, "clean": True,
     }  # fmt: skip
+    assert record["foreign_points"] == {"object": 0, "target": 0}
     assert record["energy"] == dataclasses.asdict(tdf.EnergyWeights(0.02))
     assert record["optimiser"] == dataclasses.asdict(tdf.OptimizeConfig(num_starts=3, iterations=3))
     assert record["weights"]["name"] == "small"

@@ -95,6 +95,13 @@ def test_it_prints_a_summary():
     assert "3 of 3 candidates became non-finite" in repr(canned((np.nan,) * 3))
 
 
+def test_it_prints_how_many_points_were_foreign():
+    assert "foreign" not in repr(canned())
+    words = repr(canned(foreign_points=np.int32(7), target_foreign_points=np.int32(3)))
+    assert "foreign points  removed 7 of the object's cloud, 3 of the target's cloud" in words
+    assert "removed 3 of the target's cloud" in repr(canned(target_foreign_points=np.int32(3)))
+
+
 def test_a_batch_and_traced_values_print_their_shapes():
     batch = jax.tree.map(lambda part: jnp.asarray(part)[None], canned())
     assert "(1, 3, 2, 7)" in repr(batch)
