@@ -17,7 +17,7 @@ from tdf_jax._internal.precision import full_precision
 from tdf_jax._internal.units import CENTIMETRES, INCHES, MILLIMETRES
 from tdf_jax.geometry import sampling
 from tdf_jax.networks.field import DescriptorField
-from tdf_jax.networks.foreign import MOST, find_foreign, remote_points
+from tdf_jax.networks.foreign import MOST, extent_of, find_foreign, remote_points
 from tdf_jax.networks.model import Model, ModelInfo
 from tdf_jax.networks.occupancy import condition, encode_latent
 
@@ -119,7 +119,6 @@ def encode(
     checks.near("encode()", "points", cloud)
     kept = _gathered(cloud, model.config.neighbours) if clean else np.ones(len(cloud), bool)
     cloud = cloud[kept]
-    _warn_of_size(model.info, cloud)
     field = _field(model, cloud, num_subsamples, num_subsamples)
     if clean and _judges(model, cloud):
         fitting = find_foreign(
@@ -129,9 +128,10 @@ def encode(
             lambda part, exact: _field(model, cloud[part], num_subsamples if exact else 1, num_subsamples),
         )
         if fitting.field is not None:
-            field, kept[kept] = fitting.field, fitting.kept
+            field, kept[kept], cloud = fitting.field, fitting.kept, cloud[fitting.kept]
         elif not fitting.kept.all():
             _warn_of_foreign(int((~fitting.kept).sum()), len(cloud))
+    _warn_of_size(model.info, cloud)
     return (field, kept) if return_kept else field
 
 
@@ -150,9 +150,8 @@ def _judges(model: Model, cloud) -> bool:
     info = model.info
     if None in (info.cloud_points, info.smallest_diagonal, info.largest_diagonal) or checks.traced(model.params):
         return False
-    diagonal = float(np.linalg.norm(np.ptp(cloud.astype(np.float64), axis=0)))
     least, most = _sizes(info)
-    return len(cloud) >= LEAST_JUDGED and least <= diagonal <= most
+    return len(cloud) >= LEAST_JUDGED and least <= extent_of(cloud.astype(np.float64)) <= most
 
 
 def _warn_of_foreign(number: int, count: int) -> None:
