@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-WIDTH, HEIGHT, FOVY = 320, 240, 45.0  # pixels and degrees
+WIDTH, HEIGHT, FOVY = 640, 480, 45.0  # pixels and degrees
 DISTANCES, ELEVATIONS = (0.4, 1.0), (20.0, 70.0)  # metres from the object, and degrees above the horizontal
 # Metres: standard deviation of a depth at a distance. It grows with the distance squared, as that of stereo cameras.
 NOISE, NOISE_DISTANCE = 0.001, 0.7
