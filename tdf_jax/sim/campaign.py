@@ -26,6 +26,7 @@ from tdf_jax.sim.tasks import Episode, NotDrawn
 if TYPE_CHECKING:
     from tdf_jax.sim.robot import Robot
 
+FORMAT = 1  # format number; raise it when what becomes of an imitation changes
 MOST_PROCESSES = 1024  # more are a mistake
 
 
@@ -151,7 +152,7 @@ def run_one(settings: Settings, number: int, view: bool = False) -> Run:
 def _kept(settings: Settings, number: int, view: bool = False) -> dict[str, np.ndarray]:
     """The arrays of an episode: kept, or computed and kept."""
     imitator = load_imitator(settings)
-    about = ["episode", *imitator.depends_on(number), *settings.condition]
+    about = ["episode", FORMAT, *imitator.depends_on(number), *settings.condition]
     # A viewed episode runs, also if its outcome is kept.
     viewed = _run(imitator, number, view=True) if view else None
     return kept("tdf simulate", settings.folder, about, lambda: viewed or _run(imitator, number))

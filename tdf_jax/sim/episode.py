@@ -23,6 +23,7 @@ from tdf_jax.sim.workcell import FIXTURE, OBJECT, TARGET, Workcell, build_workce
 
 MODES = ("execute", "teleport")
 SETTLE = 2.0  # seconds after the release, as in NDF and R-NDF
+LAST = 0.1  # seconds at the end of them in which a contact counts: a mug that swings leaves its peg for moments
 MOVING = 0.25  # m/s, faster than a mug that swings on its peg, which nothing damps but friction
 UPSIDE_DOWN = 1.0  # seconds with gravity reversed
 FALLS = 0.03  # metres that an object moves from its target then, unless it is stuck in it
@@ -201,9 +202,9 @@ def run_episode(
     data = cell.data()
     observer = _Observer(cell, watch, noted)
     execute(cell, data, plan.motion, observer)
-    settle(cell, data)
+    contacts = settle(cell, data)
     observer.note(data, "end")
-    placed, cause, detail, criteria = _judged(episode, cell, data)
+    placed, cause, detail, criteria = _judged(episode, cell, data, contacts)
     criteria["no_collision"] = not observer.collided
     slip, turn = observer.moved_in_hand()
     held = observer.held
@@ -245,7 +246,7 @@ class _Observer:
             self.note(data, "closed")
         if step % WATCHED:
             return
-        pairs = {tuple(pair) for pair in np.sort(self.kinds[data.contact.geom[: data.ncon]], axis=1).tolist()}
+        pairs = _contacts(self.kinds, data)
         if not self.collided:
             for a, b, words in (
                 (ARM, TABLE_KIND, "the arm touches the table"),
@@ -292,8 +293,7 @@ def _reset(episode: Episode, T_world_object) -> Verdict:
     """Reset the object, let 2 s pass, and judge."""
     cell = reset_cell(episode, T_world_object)
     data = cell.data()
-    settle(cell, data)
-    verdict = _judged(episode, cell, data)
+    verdict = _judged(episode, cell, data, settle(cell, data))
     comes_off = _comes_off(episode, cell.body_pose(data, OBJECT), cell.body_pose(data, TARGET))
     verdict.criteria["comes_off"] = comes_off
     if verdict.placed and not comes_off:
@@ -331,22 +331,32 @@ def _comes_off(episode: Episode, T_object, T_target) -> bool:
     return bool(np.linalg.norm(turned.body_pose(data, OBJECT)[:3, 3] - T_object[:3, 3]) >= FALLS)
 
 
-def settle(cell: Workcell, data: Any) -> None:
+def settle(cell: Workcell, data: Any) -> set[tuple[int, int]]:
     """Let 2 s pass.
 
     Args:
         cell: the cell.
         data: its state, which changes.
+
+    Returns:
+        Pairs of kinds of geoms (see `tdf_jax.sim.collision`), the smaller number first, that met in the last 0.1 s.
     """
     mujoco = extra("run_episode()", "mujoco")
-    for _ in range(int(SETTLE / TIMESTEP)):
+    kinds, steps, contacts = geom_kinds(cell), round(SETTLE / TIMESTEP), set()
+    for step in range(steps):
         mujoco.mj_step(cell.model, data)
+        if step >= steps - round(LAST / TIMESTEP):
+            contacts |= _contacts(kinds, data)
+    return contacts
 
 
-def _judged(episode: Episode, cell: Workcell, data: Any) -> Verdict:
-    """Whether the object is placed, by each criterion that a state shows."""
-    kinds = geom_kinds(cell)
-    pairs = {tuple(pair) for pair in np.sort(kinds[data.contact.geom[: data.ncon]], axis=1).tolist()}
+def _contacts(kinds: np.ndarray, data: Any) -> set[tuple[int, int]]:
+    """Pairs of kinds of geoms that are in contact, the smaller number first."""
+    return {(a, b) for a, b in np.sort(kinds[data.contact.geom[: data.ncon]], axis=1).tolist()}
+
+
+def _judged(episode: Episode, cell: Workcell, data: Any, contacts: set[tuple[int, int]]) -> Verdict:
+    """Whether the object is placed, by each criterion that the end shows."""
     T_target_object = np.linalg.inv(cell.body_pose(data, TARGET)) @ cell.body_pose(data, OBJECT)
     is_mug = episode.object.category == "mug"
     hung = True
@@ -355,8 +365,8 @@ def _judged(episode: Episode, cell: Workcell, data: Any) -> Verdict:
         hung = any(hole_is_crossed(mug, line, T_target_object) for line in rack.peg_lines)
     tilt = float(np.degrees(np.arccos(np.clip(cell.body_pose(data, OBJECT)[2, 2], -1, 1))))
     criteria = {
-        "touches": (OBJECT_KIND, TARGET_KIND) in pairs,
-        "off_table": (OBJECT_KIND, TABLE_KIND) not in pairs,
+        "touches": (OBJECT_KIND, TARGET_KIND) in contacts,
+        "off_table": (OBJECT_KIND, TABLE_KIND) not in contacts,
         "settled": bool(np.linalg.norm(data.joint(OBJECT).qvel[:3]) <= MOVING),
         "upright": tilt <= UPRIGHT,
         "comes_off": False,

@@ -136,5 +136,19 @@ def test_errors_of_a_pick_leave_out_the_symmetries(drawn):
     assert module._pick_error(mug, mug.T_world_object @ turn @ mug.grip.T_object_grip) != ""
 
 
+def test_a_contact_shortly_before_the_end_counts(drawn, monkeypatch):
+    """A bowl that rests, and then is thrown up: in the air it has left the board less than 0.1 s ago, or more."""
+    episode = drawn("bowl_on_shelf")
+    cell = module.reset_cell(episode, episode.T_world_target @ episode.T_target_object)
+    data = cell.data()
+    on_board = (module.OBJECT_KIND, module.TARGET_KIND)
+    assert module.settle(cell, data) == {on_board}
+    data.joint("object").qvel[2] = 1.0
+    monkeypatch.setattr(module, "SETTLE", 0.08)
+    assert module.settle(cell, data) == {on_board} and data.ncon == 0
+    monkeypatch.setattr(module, "LAST", 0.02)
+    assert module.settle(cell, data) == set()
+
+
 def test_causes_are_named_once():
     assert len(set(CAUSES)) == len(CAUSES) and "" not in CAUSES
