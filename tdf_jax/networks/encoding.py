@@ -33,6 +33,8 @@ SIZE_TOLERANCE = 3.0
 # With inches, because the size of the training objects distinguishes them from centimetres.
 # Points of a cloud that is judged by its field; fewer do not say how good the field is.
 LEAST_JUDGED = 100
+# Of the largest diagonal that the network knows: its fields of larger objects, such as racks, are less exact.
+LARGEST = 0.8
 PROBABLE_UNITS = (MILLIMETRES, CENTIMETRES, INCHES)
 
 
@@ -148,10 +150,12 @@ def _gathered(cloud, least: int) -> Bool[np.ndarray, " points"]:
 def _judges(model: Model, cloud) -> bool:
     """Whether a network's fields say which points are foreign: it was trained as `tdf train` does, on such sizes."""
     info = model.info
-    if None in (info.cloud_points, info.smallest_diagonal, info.largest_diagonal) or checks.traced(model.params):
+    if info.cloud_points is None or checks.traced(model.params):
         return False
-    least, most = _sizes(info)
-    return len(cloud) >= LEAST_JUDGED and least <= extent_of(cloud.astype(np.float64)) <= most
+    if info.smallest_diagonal is None or info.largest_diagonal is None:
+        return False
+    extent = extent_of(cloud.astype(np.float64))
+    return len(cloud) >= LEAST_JUDGED and info.smallest_diagonal <= extent <= LARGEST * info.largest_diagonal
 
 
 def _warn_of_foreign(number: int, count: int) -> None:

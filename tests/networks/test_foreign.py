@@ -140,7 +140,7 @@ def test_only_networks_that_know_their_training_clouds_judge_points(small_model,
     monkeypatch.setattr(encoding, "find_foreign", find)
     points = np.concatenate([CLOUD] * 4)[:120] * 0.3 / np.linalg.norm(np.ptp(CLOUD, axis=0))
     points += 0.001 * np.random.default_rng(0).standard_normal(points.shape)
-    sizes = {"smallest_diagonal": 0.2, "largest_diagonal": 0.5}
+    sizes = {"smallest_diagonal": 0.08, "largest_diagonal": 0.5}
     for known, expected in (({}, 0), ({"cloud_points": 120}, 0), (sizes, 0), (sizes | {"cloud_points": 120}, 1)):
         judged.clear()
         model = dataclasses.replace(small_model, info=dataclasses.replace(small_model.info, **known))
