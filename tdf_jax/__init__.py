@@ -15,8 +15,8 @@ angles in radians, poses `wxyz_xyz` as in jaxlie, and `T_world_query` is the pos
 from tdf_jax._internal.errors import (
     CategoryWarning as CategoryWarning,
     ConfidenceWarning as ConfidenceWarning,
-    InputError as InputError,
     ForeignPointsWarning as ForeignPointsWarning,
+    InputError as InputError,
     InvalidPointsWarning as InvalidPointsWarning,
     SizeWarning as SizeWarning,
     TdfWarning as TdfWarning,

@@ -25,6 +25,7 @@ from tdf_jax.solvers.initial import default_goal
 from tdf_jax.solvers.multistart import SolveConfig, solve
 from tdf_jax.solvers.pick import CarryConfig, carry
 from tdf_jax.solvers.result import Result
+from tdf_jax.uncertainty.advice import look_from, points_at
 from tdf_jax.uncertainty.calibration import CALIBRATED, CURVES, confidence, recognition, surface_logit
 from tdf_jax.uncertainty.doubt import DOUBT, warn_of_category, warn_of_target
 
@@ -127,7 +128,8 @@ def imitate(
             warn_of_target("imitate()", float(result.target_residual), weights, target, placed)
             foreign_of_target = np.asarray(len(target_points) - len(placed), np.int32)
             result = dataclasses.replace(result, target_foreign_points=foreign_of_target)
-        return dataclasses.replace(_judged(result, model.info.name, field, cloud), foreign_points=foreign)
+        judged = _judged(result, model.info.name, field, cloud, reference)
+        return dataclasses.replace(judged, foreign_points=foreign)
     goal = None if goal is None else jnp.asarray(checks.pose("imitate()", "goal", goal), float)
     if goal_offset is not None:
         goal = default_goal(field, reference) if goal is None else goal
@@ -135,7 +137,8 @@ def imitate(
     settings = {"goal": goal, "fix_last": fix_last, "progress": progress, "device_mesh": device_mesh}
     if isinstance(config, CarryConfig):
         result = carry(field, reference, key, config=config, **settings)
-        return dataclasses.replace(_judged(result, model.info.name, field, cloud), foreign_points=foreign)
+        judged = _judged(result, model.info.name, field, cloud, reference)
+        return dataclasses.replace(judged, foreign_points=foreign)
     weights = EnergyWeights() if energy is None else energy
     if isinstance(config, OptimizeConfig):
         result = optimize(field, reference, key, energy=weights, config=config, **settings)
@@ -152,26 +155,33 @@ def _merged(points) -> Any:
     return np.concatenate(views)
 
 
-def _judged(result: Result, weights: str, field, points) -> Result:
-    """The result with the probabilities that shipped weights are calibrated for; NaN where they are not."""
+def _judged(result: Result, weights: str, field, points, reference: Reference) -> Result:
+    """The result with the probabilities that shipped weights are calibrated for, NaN where they are not, and advice."""
     recognised = confident = None
     if weights in CURVES:
         recognised = recognition(float(result.residual), surface_logit(field, points), CURVES[weights])
     if weights in CALIBRATED:
         confident = confidence(float(result.residual))
+    if confident is not None:
+        result = dataclasses.replace(
+            result, points_at_pick=np.asarray(points_at(points, result.pick, reference.query), np.int32)
+        )
     warn_of_category("imitate()", "object", recognised, weights, "points, their unit and the weights")
+    known: dict[str, Any] = {"recognised": recognised, "confidence": confident}
+    if confident is not None and confident < DOUBT:
+        known["look_from"] = look_from(field, points)
+    # In numpy, because under `jax_debug_nans` an array of jax must not hold NaN.
+    result = dataclasses.replace(
+        result, **{name: np.asarray(np.nan if value is None else value, np.float32) for name, value in known.items()}
+    )
     if confident is not None and confident < DOUBT and (recognised is None or recognised >= DOUBT):
         warnings.warn(
-            f"imitate(): the pick is right with a probability of {confident:.2g} only. Check that the cloud shows the "
-            "place to pick and nothing but the object, add a second view, or compare the other candidates",
+            f"imitate(): the pick is right with a probability of {confident:.2g} only: {result.advice}. Several views "
+            "are passed as points=[first, second]",
             ConfidenceWarning,
             stacklevel=caller_level(),
         )
-    known = {"recognised": recognised, "confidence": confident}
-    # In numpy, because under `jax_debug_nans` an array of jax must not hold NaN.
-    return dataclasses.replace(
-        result, **{name: np.asarray(np.nan if value is None else value, np.float32) for name, value in known.items()}
-    )
+    return result
 
 
 @host

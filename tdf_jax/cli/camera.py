@@ -64,7 +64,7 @@ def read_scene(settings: Settings) -> Seen | None:
     if masks[0] is not None and settings.clusters:
         raise InputError(f"{COMMAND}: --mask says what the object is, and --clusters finds objects; drop one")
     scale = 1.0 if settings.depth_scale is None else settings.depth_scale
-    views, pixels, camera = [], [], None
+    views, pixels, cameras = [], [], []
     for path, matrix, pose, mask in zip(settings.depth, intrinsics, poses, masks):
         T = None if pose is None else _numbers("--camera-pose", pose)
         T = T.reshape(4, 4) if T is not None and T.size == 16 else T
@@ -76,12 +76,11 @@ def read_scene(settings: Settings) -> Seen | None:
             raise InputError(f"{COMMAND}: {path}: {message}") from None
         views.append(points)
         pixels.append({"file": str(path), **counts._asdict()})
-        camera = (np.zeros(3) if T is None else T[:3, 3]) if camera is None else camera
-    cloud = np.concatenate(views)
+        cameras.append(np.zeros(3) if T is None else T[:3, 3])
     if masks[0] is None:
-        clouds = separate_objects(cloud, settings.workspace, camera=camera)
+        clouds = separate_objects(views, settings.workspace, camera=cameras)
     else:
-        clouds = [cloud]
+        clouds = [cloud := np.concatenate(views)]
         if settings.workspace is not None:
             low, high = workspace_box(COMMAND, settings.workspace)
             clouds = [cloud[((cloud >= low) & (cloud <= high)).all(axis=1)]]

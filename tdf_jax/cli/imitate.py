@@ -26,7 +26,7 @@ from tdf_jax.energy.reference import describe
 from tdf_jax.evaluation.metrics import path_error, pose_error
 from tdf_jax.evaluation.scene import Scene
 from tdf_jax.geometry.trajectory import Trajectory
-from tdf_jax.imitation import DOUBT, imitate as imitate_scene
+from tdf_jax.imitation import imitate as imitate_scene
 from tdf_jax.io.pointclouds import load_points
 from tdf_jax.io.trajectories import save_trajectory
 from tdf_jax.networks.checkpoint import load_model
@@ -280,6 +280,7 @@ def _record(
         "loss": {"start": float(result.candidate_history[result.best, 0]), "end": result.loss},
         "confidence": _plain(float(result.confidence)),
         "recognised": _plain(float(result.recognised)),
+        "advice": result.advice or None,
         "modes": _modes(config, result),
         "errors": found,
         "goal": _plain(result.goal),
@@ -345,10 +346,8 @@ def _table(record: dict, out: Path) -> str:
         rows["recognised"] = f"{record['recognised']:.2f} that the object is of the demonstration's category"
     if record["confidence"] is not None:
         rows["confidence"] = f"{record['confidence']:.2f} that the pick is right to 2 cm and 20 degrees"
-        if record["confidence"] < DOUBT:
-            rows["what to do"] = (
-                "show the place to pick to the camera, remove other objects from the cloud, check weights"
-            )
+    if record["advice"] is not None:
+        rows["what to do"] = record["advice"]
     return "\n".join(f"{name:<17}{value}" for name, value in rows.items())
 
 

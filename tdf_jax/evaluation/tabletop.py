@@ -13,7 +13,6 @@ from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.geometry.symmetry import ROUND, about_z
 from tdf_jax.perception.clusters import separate_objects
 from tdf_jax.perception.depth import flying_pixels, points_from_depth
-from tdf_jax.perception.support import remove_plane
 
 if TYPE_CHECKING:
     import trimesh
@@ -202,8 +201,6 @@ def segmented(
 ) -> Bool[np.ndarray, " points"]:
     """Which points of a scene are in the cluster that has most of the object's.
 
-    The table of several images is removed from each of them: a near camera's noise says nothing about a far one's.
-
     Args:
         table: the object on the table, and the cameras.
         views: points of the image of each camera, metres, world frame.
@@ -216,12 +213,7 @@ def segmented(
     half, below, above = WORKSPACE
     box = np.array([[*(centre - half), -below], [*(centre + half), above]])
     positions = table.T_world_cameras[:, :3, 3]
-    if len(views) == 1:
-        clusters = separate_objects(views[0], box, camera=positions[0])
-    else:
-        within = [view[((view >= box[0]) & (view <= box[1])).all(axis=1)] for view in views]
-        above_table = [remove_plane(view, camera) for view, camera in zip(within, positions, strict=True)]
-        clusters = separate_objects(np.concatenate(above_table), plane=False)
+    clusters = separate_objects(views, box, camera=positions)
     points = np.concatenate(views)
     chosen = [_rows_of(points, cluster) for cluster in clusters]
     return max(chosen, key=lambda one: np.count_nonzero(labels[one] == OWN))

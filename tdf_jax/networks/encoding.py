@@ -30,11 +30,11 @@ SAME_SIDE = np.pi / 6
 # A cloud of one side of an object is up to two times smaller than the object, and an object in another orientation has
 # another bounding box; a wrong unit is a factor of 39 or more.
 SIZE_TOLERANCE = 3.0
-# With inches, because the size of the training objects distinguishes them from centimetres.
 # Points of a cloud that is judged by its field; fewer do not say how good the field is.
 LEAST_JUDGED = 100
 # Of the largest diagonal that the network knows: its fields of larger objects, such as racks, are less exact.
 LARGEST = 0.8
+# With inches, because the size of the training objects distinguishes them from centimetres.
 PROBABLE_UNITS = (MILLIMETRES, CENTIMETRES, INCHES)
 
 

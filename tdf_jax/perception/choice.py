@@ -186,8 +186,9 @@ def _by_residual(
     for index, cloud in enumerate(clouds):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", SizeWarning)  # what is not the object may have any size
-            field = encode(model, cloud)
-            other = field if target_model is model or contact is None else encode(target_model, cloud)
+            # Most of them are of something else, and no part of that would fit a field: do not search for one.
+            field = encode(model, cloud, clean=False)
+            other = field if target_model is model or contact is None else encode(target_model, cloud, clean=False)
         as_object[index] = float(carry(field, plain, key, fix_last=False, config=config).residual)
         if contact is not None:
             on_object = region("object", field, contact.object_descriptors, contact.T_object_contact, object_key)

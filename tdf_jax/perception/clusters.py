@@ -1,5 +1,7 @@
 """Objects of a scene that stand apart from each other."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
@@ -25,7 +27,7 @@ FLAT = 2.0  # a cluster that is nowhere higher than this multiple of the table's
 
 @host
 def separate_objects(
-    points: Float[np.ndarray, "points 3"],
+    points: Float[np.ndarray, "points 3"] | Sequence[Float[np.ndarray, "_ 3"]],
     workspace: ArrayLike | None = None,
     *,
     plane: bool = True,
@@ -38,12 +40,14 @@ def separate_objects(
     Objects that touch each other stay one cluster, and an object whose visible parts are apart becomes several.
 
     Args:
-        points: points of the scene, (points, 3), metres, such as from `points_from_depth`.
+        points: points of the scene, (points, 3), metres, such as from `points_from_depth`; or a list of several views
+            of it in one world frame, whose table is removed from each by itself: its noise depends on the distance of
+            the camera.
         workspace: box that the objects are in, its smallest and its largest x, y and z, (6,) or (2, 3), metres, in the
             frame of the points. Points outside are left out first, which removes walls and floors; by default there is
             no box.
         plane: whether to remove the largest plane first, as `remove_plane` does.
-        camera: position of the camera, (3,), metres, see `remove_plane`.
+        camera: position of the camera, (3,), metres, see `remove_plane`; of several views, one for each, (views, 3).
         gap: distance between points of different objects, metres.
         min_points: smallest number of points of an object; smaller clusters are left out.
 
@@ -51,35 +55,32 @@ def separate_objects(
         One cloud for each object, the one of most points first; points in their order and type.
 
     Raises:
-        InputError: the points are no cloud, the workspace is empty, there is no plane or no object.
+        InputError: the points are no cloud, the workspace is empty, there is no plane or no object, or another number
+            of cameras than of views.
     """
     function = "separate_objects()"
-    cloud = np.asarray(checks.points(function, points))
     checks.boolean(function, "plane", plane)
     checks.positive(function, "gap", gap, "metres")
     checks.count(function, "min_points", min_points)
-    box = None if workspace is None else workspace_box(function, workspace)
-    if box is not None:
-        cloud = cloud[((cloud >= box[0]) & (cloud <= box[1])).all(axis=1)]
-        if not len(cloud):
+    views, cameras = _views(function, points, camera)
+    if workspace is not None:
+        box = workspace_box(function, workspace)
+        within = [view[((view >= box[0]) & (view <= box[1])).all(axis=1)] for view in views]
+        if not any(map(len, within)):
             raise InputError(
-                f"{function}: none of {len(np.asarray(points))} points is in the workspace {box.tolist()}; expected "
+                f"{function}: none of {sum(map(len, views))} points is in the workspace {box.tolist()}; expected "
                 "objects in it. Check its unit and its frame, which is that of the points"
             )
-    heights = None
+        views, cameras = zip(*((view, one) for view, one in zip(within, cameras) if len(view)))
+    heights = bands = None
     if plane:
-        support = find_support(function, cloud, camera)
-        if support is None:
-            raise InputError(
-                f"{function}: there is no plane of {LEAST_AREA} cm2 that covers {LEAST_SHARE:.0%} of the surface that "
-                f"{len(cloud)} points show; expected a table. If there is none, or it is removed already, pass "
-                "plane=False"
-            )
-        heights, bands = support.heights(cloud), support.bands(cloud)
-        front = heights > bands
-        cloud, heights, bands = cloud[front], heights[front], bands[front]
+        # Each view has its own table: of merged ones, that of a near camera would be the noise of a far one's.
+        above = [_above_table(function, view, one) for view, one in zip(views, cameras)]
+        views, heights, bands = zip(*above)
+        heights, bands = np.concatenate(heights), np.concatenate(bands)
+    cloud = np.concatenate(views)
     clusters = clusters_of(cloud, gap)
-    if plane and heights is not None:
+    if heights is not None and bands is not None:
         clusters = _joined(cloud, clusters, heights, gap)
         high = np.unique(clusters[heights > FLAT * bands])
         clusters = np.where(np.isin(clusters, high), clusters, -1)
@@ -94,6 +95,36 @@ def separate_objects(
             "unit and the camera, or lower min_points"
         )
     return [cloud[clusters == index] for index in large[np.argsort(-sizes[large], kind="stable")]]
+
+
+def _views(function: str, points, camera) -> tuple[list[np.ndarray], list]:
+    """The views, and the camera of each, or None."""
+    if not isinstance(points, list | tuple) or not points or not all(np.ndim(view) == 2 for view in points):
+        return [np.asarray(checks.points(function, points))], [camera]
+    views = [np.asarray(checks.points(function, view, f"points[{index}]")) for index, view in enumerate(points)]
+    if camera is None:
+        return views, [None] * len(views)
+    positions = checks.numbers(function, "camera", camera)
+    if positions.shape != (len(views), 3):
+        raise InputError(
+            f"{function}: camera has the shape {positions.shape}; expected the position of the camera of each of "
+            f"{len(views)} views, ({len(views)}, 3)"
+        )
+    return views, list(positions)
+
+
+def _above_table(function: str, view: np.ndarray, camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points of a view above its largest plane, their heights, and those up to which a point is the plane's."""
+    support = find_support(function, view, camera)
+    if support is None:
+        raise InputError(
+            f"{function}: there is no plane of {LEAST_AREA} cm2 that covers {LEAST_SHARE:.0%} of the surface that "
+            f"{len(view)} points show; expected a table. If there is none, or it is removed already, pass "
+            "plane=False"
+        )
+    heights, bands = support.heights(view), support.bands(view)
+    front = heights > bands
+    return view[front], heights[front], bands[front]
 
 
 def clusters_of(points: Float[np.ndarray, "points 3"], gap: float = GAP) -> Int[np.ndarray, " points"]:

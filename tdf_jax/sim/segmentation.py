@@ -65,7 +65,7 @@ def segmented_points(
     (x, y, top), (half_x, half_y, half) = TABLE
     low, high = np.array([x - half_x, y - half_y, top + half]), np.array([x + half_x, y + half_y, top + half])
     box = np.stack([low + (0, 0, HEIGHTS[0]), high + (0, 0, HEIGHTS[1])])
-    found = separate_objects(np.concatenate(clouds), box, camera=cameras[0].T_world_camera[:3, 3])
+    found = separate_objects(clouds, box, camera=[camera.T_world_camera[:3, 3] for camera in cameras])
     return min(found, key=lambda points: float(np.linalg.norm(points - middle, axis=1).min()))
 
 

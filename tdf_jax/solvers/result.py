@@ -30,6 +30,14 @@ def _none() -> np.ndarray:
     return np.zeros((), np.int32)
 
 
+def _uncounted() -> np.ndarray:
+    return np.full((), -1, np.int32)
+
+
+def _nowhere() -> np.ndarray:
+    return np.full(3, np.nan, np.float32)
+
+
 def _unknown() -> np.ndarray:
     return np.full((), np.nan, np.float32)
 
@@ -52,6 +60,8 @@ def _unknown() -> np.ndarray:
         "seatings",
         "foreign_points",
         "target_foreign_points",
+        "points_at_pick",
+        "look_from",
     ],
     meta_fields=["grasp", "release"],
 )
@@ -92,6 +102,10 @@ class Result:
         foreign_points: number of points of the object's cloud that were removed because they are not of the object, see
             `encode`; a scalar, set by `imitate`.
         target_foreign_points: the same for the new target's cloud.
+        points_at_pick: number of points of the object's cloud in the box of query points at the pick; a scalar, set by
+            `imitate` where it gives a confidence, else -1.
+        look_from: direction from the object towards a camera that would see what is expected and not seen yet, (3,),
+            unit vector, world frame; set by `imitate` where the confidence is below one half, else NaN.
         grasp: index of the pose at which the object is grasped; poses before it are the approach.
         release: index of the pose at which it is released, from the end: -1 unless there is a retreat.
     """
@@ -112,6 +126,8 @@ class Result:
     seatings: Float[Array | np.ndarray, "*batch targets 3"] = dataclasses.field(default_factory=_no_seatings)
     foreign_points: Int[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_none)
     target_foreign_points: Int[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_none)
+    points_at_pick: Int[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_uncounted)
+    look_from: Float[Array | np.ndarray, "*batch 3"] = dataclasses.field(default_factory=_nowhere)
     grasp: int = 0
     release: int = -1
 
@@ -189,6 +205,30 @@ class Result:
         return f"{len(failed)} of {finite.size} {kind} became non-finite: {names}"
 
     @property
+    @public
+    def advice(self) -> str:
+        """What to do about a pick that is probably wrong, in words; empty if there is nothing to say.
+
+        Raises:
+            InputError: the result is a batch, or traced.
+        """
+        from tdf_jax.uncertainty.advice import SEEN  # what is displayed may look there, see `_distinct_picks`
+        from tdf_jax.uncertainty.doubt import DOUBT
+
+        if checks.traced(self.confidence, self.look_from) or np.ndim(self.confidence):
+            raise InputError(
+                "Result.advice: the result is a batch or traced; expected one result outside of a trace. Take one with "
+                "jax.tree.map(lambda x: x[i], result)"
+            )
+        if not float(self.confidence) < DOUBT:
+            return ""
+        unseen = int(self.points_at_pick) < SEEN
+        place = f"its place is not seen ({int(self.points_at_pick)} points of the cloud are there); " * unseen
+        if not np.isfinite(np.asarray(self.look_from)).all():
+            return f"{place}compare the other candidates, and check that the cloud shows nothing but the object"
+        return f"{place}look from {_numbers(self.look_from)}, world frame, from the object to the camera"
+
+    @property
     def _numpy(self):
         return jnp if checks.traced(self.energies, self.trajectories) else np
 
@@ -239,6 +279,8 @@ class Result:
         ):
             value = float(getattr(self, name))
             rows[name] = f"{value:.2f} {words}" if np.isfinite(value) else "unknown"
+        if self.advice:
+            rows["advice"] = self.advice
         rows["solutions"] = f"{_distinct_picks(self)} distinct picks"
         return rows
 

@@ -33,7 +33,7 @@ def look_from(field: DescriptorField, points: Float[Array | np.ndarray, "points 
     side = np.linspace(-REACH * size, REACH * size, CELLS)
     grid = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1) + middle
     inside = np.asarray(field.occupancy(jnp.asarray(grid.reshape(-1, 3), jnp.float32))).reshape(grid.shape[:3]) > 0.5
-    surface = grid[inside & ~binary_erosion(inside)]
+    surface = grid[inside & (binary_erosion(inside) == 0)]
     if not len(surface):
         return np.full(3, np.nan)
     unseen = surface[KDTree(cloud).query(surface)[0] > UNSEEN * size]

@@ -110,6 +110,20 @@ def test_unevenness_of_the_table_is_no_object(scene):
     assert len(separate_objects(np.concatenate([scene, bump]))) == 3
 
 
+def test_the_table_of_a_far_view_is_removed_by_its_own_noise(parts):
+    """Merged with a near view of nine times as many points, a sixth of a far one's table would be above its noise."""
+    near, far = np.concatenate([table(1), *parts]), table(2)[:3000] * (1, 1, 6)
+    found = separate_objects([near, far], camera=[(0, 0, 0.5), (0.3, 0, 1.2)])
+    assert len(found) == 3
+    for cloud, part in zip(found, parts):
+        assert len(rows(cloud) - rows(part)) <= 0.01 * len(cloud) and len(rows(part) - rows(cloud)) <= 0.01 * len(part)
+    assert sum(map(len, separate_objects(np.concatenate([near, far]), camera=(0, 0, 0.5)))) > 1.01 * sum(
+        map(len, found)
+    )
+    with pytest.raises(tdf.InputError, match=r"camera has the shape \(3,\); expected .* of each of 2 views"):
+        separate_objects([near, far], camera=(0, 0, 0.5))
+
+
 @pytest.mark.parametrize(
     ("keywords", "words"),
     [

@@ -95,6 +95,24 @@ def test_it_prints_a_summary():
     assert "3 of 3 candidates became non-finite" in repr(canned((np.nan,) * 3))
 
 
+def test_a_doubtful_result_says_where_to_look_from():
+    doubtful = {"confidence": np.float32(0.3), "points_at_pick": np.int32(4)}
+    somewhere = np.array([0.6, -0.8, 0.0], np.float32)
+    assert canned().advice == "" and "advice" not in repr(canned())
+    assert canned(confidence=np.float32(0.7), look_from=somewhere).advice == ""
+    unseen = canned(**doubtful, look_from=somewhere)
+    assert unseen.advice.startswith(
+        "its place is not seen (4 points of the cloud are there); look from (0.600, -0.800,"
+    )
+    assert unseen.advice in repr(unseen)
+    seen = canned(**doubtful | {"points_at_pick": np.int32(300)}, look_from=somewhere)
+    assert seen.advice.startswith("look from (0.600")
+    assert "compare the other candidates" in canned(**doubtful).advice
+    batch = canned(confidence=np.full(2, 0.3, np.float32))
+    with pytest.raises(InputError, match="the result is a batch or traced"):
+        _ = batch.advice
+
+
 def test_it_prints_how_many_points_were_foreign():
     assert "foreign" not in repr(canned())
     words = repr(canned(foreign_points=np.int32(7), target_foreign_points=np.int32(3)))
