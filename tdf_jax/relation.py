@@ -170,11 +170,14 @@ def reference_of(function: str, model: Model, demonstration, target_points, targ
         The reference.
 
     Raises:
-        InputError: a new target, or a network for it, without a demonstrated one.
+        InputError: a new target, or a network for it, without a demonstrated one; or no new target, and several
+            demonstrations whose targets stand at different places.
     """
     if isinstance(demonstration, Reference):
         reference = demonstration
     else:
+        if target_points is None and not isinstance(demonstration, Demonstration):
+            _check_one_target(function, demonstration)
         side = target_model if target_points is None or target_model is not None else model
         reference = describe(model, demonstration, target_model=side)
     if reference.contact is None and (target_points is not None or target_model is not None):
@@ -187,6 +190,19 @@ def reference_of(function: str, model: Model, demonstration, target_points, targ
             "describe(model, demonstration, target_model=...)"
         )
     return reference
+
+
+def _check_one_target(function: str, demonstrations) -> None:
+    targets = [demo.target for demo in demonstrations if getattr(demo, "target", None) is not None]
+    for other in targets[1:]:
+        if not (
+            np.array_equal(other.points, targets[0].points)
+            and np.allclose(other.T_world_contact, targets[0].T_world_contact)
+        ):
+            raise InputError(
+                f"{function}: the targets of {len(targets)} demonstrations differ, and there are no target_points: it "
+                "is not known which of them stands there; expected target_points, or demonstrations on one target"
+            )
 
 
 def target_field(

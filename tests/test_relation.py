@@ -327,7 +327,13 @@ def test_targets_that_cannot_be_are_refused(small_model, demonstration, related,
     far = np.array([1.0, 0, 0, 0, 9, 9, 9])
     with pytest.raises(InputError, match=r"Target\(\): the contact points are .* m from the target"):
         dataclasses.replace(related.target, T_world_contact=far)
-    away = tdf.Target(np.asarray(related.target.points) + far[4:], related.target.query, far)
+    query = np.asarray(related.target.query)
+    low, high = (side(related.target.points, axis=0) for side in (np.min, np.max))
+    beside = np.array([1.0, 0, 0, 0, *(high - query.min(axis=0))]) + 0.25 * np.linalg.norm(high - low) * np.eye(7)[6]
+    with pytest.raises(InputError, match=r"Target\(\): the contact points are .* m from the target"):
+        dataclasses.replace(related.target, T_world_contact=beside)
+    moved_frame = np.asarray(related.target.T_world_contact) + [0, 0, 0, 0, 9, 9, 9]
+    away = tdf.Target(np.asarray(related.target.points) + far[4:], related.target.query, moved_frame)
     with pytest.raises(InputError, match="m from the object, moved to the release"):
         dataclasses.replace(related, target=away)
     other = dataclasses.replace(related.target, query=related.target.query + 0.01)
@@ -337,6 +343,21 @@ def test_targets_that_cannot_be_are_refused(small_model, demonstration, related,
         tdf.describe(small_model, [related, demonstration])
     with pytest.raises(InputError, match="target is a str; expected a tdf.Target"):
         dataclasses.replace(demonstration, target="rack")
+
+
+def test_several_demonstrations_need_a_target_that_is_known(small_model, related, moved):
+    """Which of two targets stands there is not known; if they are one, it is."""
+    shift = np.array([0.0, 0, 0, 0, 0.6, 0, 0])
+    target = related.target
+    elsewhere = tdf.Target(
+        np.asarray(target.points) + shift[4:], target.query, np.asarray(target.T_world_contact) + shift
+    )
+    moved_path = tdf.Trajectory(related.trajectory.wxyz_xyz + jnp.asarray(shift, jnp.float32))
+    other = dataclasses.replace(related, points=related.points + shift[4:], trajectory=moved_path, target=elsewhere)
+    for call in (tdf.relate, tdf.imitate):
+        with pytest.raises(InputError, match="targets of 2 demonstrations differ, and there are no target_points"):
+            call(small_model, [related, other], points=moved[0], key=KEY, config=SEARCH)
+    assert np.isfinite(tdf.relate(small_model, [related, related], points=moved[0], key=KEY, config=SEARCH)).all()
 
 
 def test_a_target_survives_the_file(tmp_path, related):

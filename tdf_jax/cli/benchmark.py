@@ -230,7 +230,7 @@ def _relations(out: Path, settings: dict) -> None:
     from tdf_jax.evaluation.conditions import SCALES
     from tdf_jax.evaluation.records import write_record
     from tdf_jax.evaluation.relation_report import page, record
-    from tdf_jax.evaluation.relation_scores import DEMONSTRATIONS, METHODS, Condition, Networks, run
+    from tdf_jax.evaluation.relation_scores import DEMONSTRATIONS, LIBRARY, METHODS, UNSEATED, Condition, Networks, run
     from tdf_jax.evaluation.relation_tasks import RELATIONS, draw_pair
     from tdf_jax.geometry.winding import libigl
     from tdf_jax.networks.checkpoint import load_model
@@ -253,6 +253,11 @@ def _relations(out: Path, settings: dict) -> None:
             )
     for count in settings["demonstrations"]:
         checks.choice("tdf benchmark", "--demonstrations", count, (1, DEMONSTRATIONS))
+    if 1 not in settings["demonstrations"] and not {LIBRARY, UNSEATED} & set(names):
+        raise InputError(
+            f"tdf benchmark --relations: --methods {' '.join(names)} have one demonstration, and --demonstrations is "
+            f"{DEMONSTRATIONS}; expected 1"
+        )
     for flag, side in (("object_weights", "object"), ("target_weights", "target")):
         sides = sorted({getattr(RELATIONS[task], side) for task in settings["tasks"]})
         if settings[flag] is not None and len(sides) > 1:

@@ -124,6 +124,10 @@ def simulate(
     check_condition(condition)
     if recursive and meshes is None:
         raise InputError("tdf simulate: --recursive is of --meshes; expected both, or neither")
+    if target_weights is not None and TASKS[task].target == "board":
+        raise InputError(
+            f"tdf simulate: --target-weights is given, and the {TASKS[task].target} of {task} needs none; drop it"
+        )
     if target_weights is None:
         target_weights = _shipped(TASKS[task].target)
     settings = Settings(

@@ -25,10 +25,10 @@ from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.model import Model, fingerprint
-from tdf_jax.relation import Objects, Relations, find_relations
+from tdf_jax.relation import Objects, Relations, find_relations, kept_points
 from tdf_jax.solvers.pick import CarryConfig
 
-FORMAT = 10  # format number; raise it when the computation of a placement or of its verdict changes
+FORMAT = 11  # format number; raise it when the computation of a placement or of its verdict changes
 LIBRARY, UNSEATED = "tdf_jax", "unseated"
 METHODS = (LIBRARY, UNSEATED, "ICP", "centroids")
 DEMONSTRATIONS = 10  # pairs that demonstrate; with one demonstration, each is that of a tenth of the tests
@@ -182,12 +182,10 @@ class _Attempts:
     def _found(self) -> tuple[Relations, float]:
         reference, placement = self._demonstrators.reference(self._shown), self._placement
         began = time.perf_counter()
-        objects = Objects(
-            placement.points,
-            placement.target_points,
-            encode(self._networks.object, placement.points),
-            encode(self._networks.target, placement.target_points),
-        )
+        field, kept = encode(self._networks.object, placement.points, return_kept=True)
+        target, kept_of_target = encode(self._networks.target, placement.target_points, return_kept=True)
+        points = kept_points(placement.points, kept), kept_points(placement.target_points, kept_of_target)
+        objects = Objects(*points, field, target)
         key = jax.random.fold_in(jax.random.key(self._seed), self._number)
         found = find_relations("tdf benchmark", objects, reference, key, CarryConfig(), seat=True)
         return found, time.perf_counter() - began

@@ -13,7 +13,7 @@ from tdf_jax.geometry import se3
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 # Largest distance of the contact points from the cloud, its diagonals. Descriptors fade with the distance.
-FARTHEST_CONTACT = 0.25
+FARTHEST_CONTACT = 0.2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,16 +60,16 @@ def check_contact(function: str, what: str, cloud: np.ndarray, query: np.ndarray
         T_world_contact: pose of the contact frame, `wxyz_xyz`, (7,), in the frame of the cloud.
 
     Raises:
-        InputError: the nearest contact point is farther away than a quarter of the cloud's diagonal.
+        InputError: the nearest contact point is farther from the nearest point than a fifth of the cloud's diagonal.
     """
+    from scipy.spatial import KDTree
+
     contact = np.asarray(se3.transform(jnp.asarray(T_world_contact), jnp.asarray(query)))
-    # The distance to the bounding box is at most that to the cloud, and quick for large clouds.
-    low, high = cloud.min(axis=0), cloud.max(axis=0)
-    outside = np.linalg.norm(np.maximum(0, np.maximum(low - contact, contact - high)), axis=1)
-    diagonal = np.linalg.norm(high - low)
-    if outside.min() > FARTHEST_CONTACT * diagonal:
+    nearest = KDTree(np.asarray(cloud, float)).query(np.asarray(contact, float))[0].min()
+    diagonal = np.linalg.norm(np.ptp(cloud, axis=0))
+    if nearest > FARTHEST_CONTACT * diagonal:
         raise InputError(
-            f"{function}: the contact points are {outside.min():.3g} m from the {what}, whose diagonal is "
+            f"{function}: the contact points are {nearest:.3g} m from the {what}, whose diagonal is "
             f"{diagonal:.3g} m; expected them where object and target meet at the release. Check their frame and unit, "
             "or take tdf.contact_query"
         )

@@ -98,7 +98,7 @@ def run_campaign(
     check_counts("run_campaign()", episodes, processes, "")
     for scan in load_objects(settings)[:episodes]:
         _ = scan.body  # split into convex parts once, and not in every process
-    count = min(episodes, processes or len(os.sched_getaffinity(0)))
+    count = min(episodes, processes or _cores())
     bar = tqdm(
         total=episodes,
         desc=f"{settings.condition.task}, {settings.condition.mode}",
@@ -111,10 +111,20 @@ def run_campaign(
             for one in pending:
                 yield one.result()
                 bar.update()
+        except concurrent.futures.process.BrokenProcessPool:
+            raise InputError(
+                "tdf simulate: a process ended by itself, perhaps for lack of memory; what is finished is kept. Run "
+                "the command again, with --processes 1 if it ends again"
+            ) from None
         finally:
             for one in pending:
                 one.cancel()
             bar.close()
+
+
+def _cores() -> int:
+    """Number of cores that this process may use; of all, where the system does not say."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextlib.contextmanager

@@ -178,12 +178,14 @@ def planned_rows(
         ("targets", "target", targets or ()),
         ("methods", "method", methods),
         ("tasks", "task", tasks),
+        ("masks", "mask", masks),
     ):
         for value in values:
             if value not in {getattr(row, field) for row in rows}:
                 raise InputError(
                     f"{function}: --{flag} has {value!r}, for which there is no row with the other options; expected "
-                    "--targets known for shelves, and --demonstrations 10 for tdf_jax with --targets found only"
+                    "--targets known for shelves, --demonstrations 10 for tdf_jax with --targets found only, and "
+                    "--masks with --clouds of cameras"
                 )
     return rows
 

@@ -93,8 +93,8 @@ class Result:
             `tdf_jax.recognition`; a scalar, set by `imitate` with shipped weights.
         target_trajectories: pose of the contact frame on the target of each candidate, (candidates, 1, 7),
             T_world_contact; no candidates unless the demonstration has a target.
-        target_residual: normalised descriptor energy of the contact points on the target, of the best candidate; a
-            scalar, NaN if the target has not moved.
+        target_residual: normalised descriptor energy of the contact points on the target, of the pose at which it is
+            the least, before registration and seating; a scalar, NaN if the target has not moved.
         target_confidence: probability that the contact pose on the target is right; a scalar, NaN where it is not
             calibrated.
         seatings: displacement of the placed object by which it touches its target, world frame, (candidates, 3),

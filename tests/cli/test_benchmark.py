@@ -552,6 +552,10 @@ def test_relations_are_measured_and_reported(tmp_path, capsys):
         (("--clouds", "half"), "--clouds is 'half'; expected no condition of size with --relations"),
         (("--demonstrations", "3"), "--demonstrations is 3; expected one of 1, 10"),
         (("--pairs", "0"), "--pairs is 0"),
+        (
+            ("--methods", "ICP", "--demonstrations", "10"),
+            "--methods ICP have one demonstration, and --demonstrations is 10",
+        ),
         (("--tasks",), "--tasks is empty; expected at least one"),
         (("--pose", "sideways"), "sideways"),
         (("--seed", "-1"), "--seed is -1"),
@@ -684,7 +688,7 @@ def test_true_picks_are_simulated_and_kept(tmp_path, capsys):
     assert [row["condition"]["mode"] for row in record["rows"]] == ["teleport", "execute"]
     assert all(row["rates"]["overall"]["rate"] == 1 for row in record["rows"])
     kept = sorted((tmp_path / "runs").iterdir())
-    assert len(kept) == 2
+    assert len(kept) == 3  # one imitation, and what became of it in each mode
     times = [one.stat().st_mtime_ns for one in kept]
     page = (tmp_path / "simulation.md").read_bytes()
     run(*words, "--processes", 1, "--out", tmp_path)  # reads what is kept: the times too

@@ -34,6 +34,8 @@ def refusal(tmp_path, capsys, monkeypatch):
     ("words", "message"),
     [
         (["--episodes", 0], "--episodes is 0; expected"),
+        (["--task", "bowl_on_shelf", "--target-weights", "mug"], "the board of bowl_on_shelf needs none; drop it"),
+        (["--clouds", "full", "--mask", "simulator"], "mask is 'simulator', and complete clouds need none"),
         (["--episodes", 2**70], "--episodes is 1180591620717411303424; expected a whole number from 1 to 1000000"),
         (["--processes", 0], "--processes is 0; expected"),
         (["--processes", 2**70], "--processes is 1180591620717411303424; expected a whole number from 1 to 1024"),
@@ -109,4 +111,4 @@ def test_a_run_prints_rates_and_writes_them(tmp_path, capsys, mode):
     made = json.loads(out.read_text())
     assert made["rates"]["overall"]["rate"] == 1 and made["condition"]["mode"] == mode
     assert "overall: 100 %" in capsys.readouterr().out
-    assert len(list((tmp_path / "kept").iterdir())) == 1
+    assert len(list((tmp_path / "kept").iterdir())) == 2  # what was imitated, and what became of it

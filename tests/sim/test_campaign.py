@@ -83,7 +83,7 @@ def test_a_run_is_resumed(first, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [one for one in METHODS if one != LIBRARY])  # it has whole runs
+@pytest.mark.parametrize("method", METHODS)
 def test_every_method_gives_a_path_and_a_motion(robot, tmp_path, method):
     imitator = Imitator(settings(tmp_path, SHELF._replace(method=method, mass=0.01)))
     episode, shown = imitator.episode(4)
