@@ -18,7 +18,7 @@ class ConfidenceWarning(TdfWarning):
 
 
 class ForeignPointsWarning(TdfWarning):
-    """Issued if so many points of a cloud look foreign to its object that none of them is removed."""
+    """Issued if points near an object are removed from its cloud as foreign, or so many look it that none is."""
 
 
 class SizeWarning(TdfWarning):

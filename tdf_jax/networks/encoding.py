@@ -95,7 +95,8 @@ def encode(
             the points are denser than the network's and traced by `jax.jit`.
 
     Warns:
-        ForeignPointsWarning: more than 30 % of the points look foreign; they are not removed.
+        ForeignPointsWarning: points near the object are removed; or more than 30 % of the points look foreign, and
+            none is removed.
         SizeWarning: the cloud is far smaller or larger than the objects that the network was trained on.
     """
     if not isinstance(model, Model):
@@ -130,6 +131,7 @@ def encode(
             lambda part, exact: _field(model, cloud[part], num_subsamples if exact else 1, num_subsamples),
         )
         if fitting.field is not None:
+            _warn_of_removed(int((~fitting.kept).sum()), len(cloud))
             field, kept[kept], cloud = fitting.field, fitting.kept, cloud[fitting.kept]
         elif not fitting.kept.all():
             _warn_of_foreign(int((~fitting.kept).sum()), len(cloud))
@@ -156,6 +158,17 @@ def _judges(model: Model, cloud) -> bool:
         return False
     extent = extent_of(cloud.astype(np.float64))
     return len(cloud) >= LEAST_JUDGED and info.smallest_diagonal <= extent <= LARGEST * info.largest_diagonal
+
+
+def _warn_of_removed(number: int, count: int) -> None:
+    # Where what touches an object looks like a part of it, that part of the object itself may be what is removed.
+    warnings.warn(
+        f"encode(): {number} of {count} points are removed, because they do not fit the field of the others. If "
+        "something of the same kind touches the object, they may be a part of the object itself: cut it out by a mask, "
+        "or pass clean=False",
+        ForeignPointsWarning,
+        stacklevel=caller_level(),
+    )
 
 
 def _warn_of_foreign(number: int, count: int) -> None:

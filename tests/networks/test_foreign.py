@@ -153,6 +153,20 @@ def test_only_networks_that_know_their_training_clouds_judge_points(small_model,
     assert len(judged) == 1
 
 
+def test_points_near_an_object_are_not_removed_in_silence(small_model, monkeypatch):
+    points = np.concatenate([CLOUD] * 4)[:120] * 0.3 / np.linalg.norm(np.ptp(CLOUD, axis=0))
+    points += 0.001 * np.random.default_rng(0).standard_normal(points.shape)
+    known = {"smallest_diagonal": 0.08, "largest_diagonal": 0.5, "cloud_points": 120}
+    model = dataclasses.replace(small_model, info=dataclasses.replace(small_model.info, **known))
+    kept = np.arange(len(points)) < 100
+    part = tdf.encode(model, points[:100], clean=False)
+    monkeypatch.setattr(encoding, "find_foreign", lambda *about: foreign.Finding(kept, part))
+    with pytest.warns(tdf.ForeignPointsWarning, match=r"encode\(\): 20 of 120 points are removed.*pass clean=False"):
+        field, mask = tdf.encode(model, points, return_kept=True)
+    np.testing.assert_array_equal(mask, kept)
+    assert field is part
+
+
 @pytest.mark.slow
 def test_a_mug_beside_another_is_encoded_alone():
     rng, model = np.random.default_rng(0), tdf.load_model("mug")
@@ -163,7 +177,8 @@ def test_a_mug_beside_another_is_encoded_alone():
     beside = beside[np.argsort(beside[:, 1])[:300]]
     points = np.concatenate([own, beside])
     order = rng.permutation(len(points))
-    field, kept = tdf.encode(model, points[order], return_kept=True)
+    with pytest.warns(tdf.ForeignPointsWarning, match="300 of 1800 points are removed"):
+        field, kept = tdf.encode(model, points[order], return_kept=True)
     np.testing.assert_array_equal(kept, order < 1500)
     assert tdf.encode(model, own, return_kept=True)[1].all()
     jax.tree.map(np.testing.assert_array_equal, field, tdf.encode(model, points[order][kept], clean=False))
