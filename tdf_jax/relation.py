@@ -176,7 +176,7 @@ def reference_of(function: str, model: Model, demonstration, target_points, targ
     if isinstance(demonstration, Reference):
         reference = demonstration
     else:
-        if target_points is None and not isinstance(demonstration, Demonstration):
+        if target_points is None and isinstance(demonstration, list | tuple):
             _check_one_target(function, demonstration)
         side = target_model if target_points is None or target_model is not None else model
         reference = describe(model, demonstration, target_model=side)

@@ -35,7 +35,7 @@ def _uncounted() -> np.ndarray:
 
 
 def _nowhere() -> np.ndarray:
-    return np.full(3, np.nan, np.float32)
+    return np.full(3, np.nan, jax.dtypes.canonicalize_dtype(np.float64))
 
 
 def _unknown() -> np.ndarray:

@@ -46,7 +46,7 @@ def hostile_cloud(rng, points):
         "whole numbers": (np.round(points * 1000).astype(int), "size"),
         "half precision": (points.astype(np.float16), None),
         "in a plane": (points * [1, 1, 0], None), "on a line": (points * [1, 0, 0], None),
-        "one point far away": (np.concatenate([points[:-1], [[90, 0, 0]]]), "size"),
+        "one point far away": (np.concatenate([points[:-1], [[90, 0, 0]]]), None),  # it is removed
         "quantised": (np.round(points / 0.01) * 0.01, None), "doubled": (np.repeat(points, 2, axis=0), None),
     }  # fmt: skip
     if rng.random() < 0.3:

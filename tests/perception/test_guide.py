@@ -36,7 +36,7 @@ def test_the_mug_is_taken_and_picked(monkeypatch, capsys):
     assert abs(names["cloud"].mean(axis=0)[1] + 0.06) < 0.03
     assert names["choice"].residuals.min() < 0.5 < names["choice"].residuals.max()
     assert float(names["result"].confidence) > 0.8
-    assert len(names["scene"]) == len(names["points"])
+    assert len(names["views"][0]) == len(names["points"])
     np.testing.assert_allclose(names["T_world_camera"][:3, :3], np.diag([1.0, -1, -1]), atol=1e-12)
     pick = np.asarray(names["result"].trajectory.matrices[0])[:3, 3]
     assert np.linalg.norm(names["cloud"] - pick, axis=1).min() < 0.02
