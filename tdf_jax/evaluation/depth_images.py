@@ -124,7 +124,7 @@ def depth_image(
         hit = cast(one.reshape(-1, 3, 3), fine, shape)
         nearer = hit < nearest
         nearest[nearer], shown[nearer] = hit[nearer], number + 1
-    rays, shown = _four(nearest), _four(shown)
+    rays, shown = four_rays(nearest), four_rays(shown)
     measured = np.isfinite(rays).all(axis=-1)
     values = np.where(measured, rays.mean(axis=-1), 0.0)
     depth, labels = np.zeros((height, width)), np.full((height, width), NOTHING)
@@ -195,6 +195,6 @@ def _table(K, T_world_camera, middle, shape):
         return np.where((np.abs(place) <= TABLE_REACH).all(axis=-1), depth, np.inf)
 
 
-def _four(values):
+def four_rays(values):
     """The four rays of every pixel, (height, width, 4)."""
     return np.stack([values[::2, ::2], values[1::2, ::2], values[::2, 1::2], values[1::2, 1::2]], axis=-1)

@@ -15,7 +15,8 @@ from jaxtyping import Array, Float
 
 from tdf_jax.energy.seating import touch_distance
 from tdf_jax.evaluation.relation_success import signed_distances
-from tdf_jax.evaluation.relation_tasks import POSES, RELATIONS, Placement, demonstrate, draw_pair, moved, place_pair
+from tdf_jax.evaluation.relation_tasks import POSES, RELATIONS, Placement, demonstrate, draw_pair, place_pair
+from tdf_jax.evaluation.tabletop import moved
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.sampling import sample_surface

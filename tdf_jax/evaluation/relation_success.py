@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
-from tdf_jax.evaluation.relation_tasks import Pair, moved
+from tdf_jax.evaluation.relation_tasks import Pair
+from tdf_jax.evaluation.tabletop import moved
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.geometry.winding import libigl

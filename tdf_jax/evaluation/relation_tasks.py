@@ -16,6 +16,7 @@ from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, SEED_SPACE
 from tdf_jax.evaluation.conditions import CONDITIONS, SCALES, observed
+from tdf_jax.evaluation.tabletop import moved
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.paths import hang_on_rack, lift_over
@@ -294,19 +295,6 @@ def _lowered(
         low, high = (middle, high) if overlap(one, target, raised) else (low, middle)
     raised[:3, 3] = T_target_object[:3, 3] + high * up
     return raised
-
-
-def moved(points: Float[np.ndarray, "points 3"], T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "points 3"]:
-    """Points after a motion.
-
-    Args:
-        points: points, (points, 3), metres.
-        T: motion, 4x4.
-
-    Returns:
-        The moved points, (points, 3).
-    """
-    return points @ T[:3, :3].T + T[:3, 3]
 
 
 RELATIONS = {

@@ -215,7 +215,7 @@ def segmented(
     positions = table.T_world_cameras[:, :3, 3]
     clusters = separate_objects(views, box, camera=positions)
     points = np.concatenate(views)
-    chosen = [_rows_of(points, cluster) for cluster in clusters]
+    chosen = [rows_of(points, cluster) for cluster in clusters]
     return max(chosen, key=lambda one: np.count_nonzero(labels[one] == OWN))
 
 
@@ -271,7 +271,7 @@ def _under(points, own, reach):
     return Delaunay(foot).find_simplex(points[:, :2]) >= 0
 
 
-def _rows_of(points, cluster):
+def rows_of(points, cluster):
     """Which points are in a cluster of some of them."""
     row = np.dtype([("", points.dtype)] * 3)
     return np.isin(np.ascontiguousarray(points).view(row)[:, 0], np.ascontiguousarray(cluster).view(row)[:, 0])

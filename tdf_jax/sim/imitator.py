@@ -260,7 +260,7 @@ class Imitator:
     def clouds(self, episode) -> tuple[np.ndarray, np.ndarray | None]:
         """Clouds of the object and of a target that is found, (points, 3) each, metres, world frame."""
         from tdf_jax.evaluation.cases import SEED_SPACE
-        from tdf_jax.evaluation.relation_tasks import moved
+        from tdf_jax.evaluation.tabletop import moved
         from tdf_jax.geometry.sampling import sample_surface
         from tdf_jax.sim.workcell import OBJECT, TARGET
 

@@ -17,7 +17,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tdf_jax._internal.files import replace_file
+from tdf_jax.evaluation.depth_images import four_rays
 from tdf_jax.evaluation.tables import markdown
+from tdf_jax.evaluation.tabletop import rows_of
 from tdf_jax.perception.clusters import separate_objects
 from tdf_jax.perception.depth import points_from_depth
 from tdf_jax.perception.support import find_support
@@ -93,11 +95,11 @@ def draw_view(shape: Shape, rng: np.random.Generator, noise: float = NOISE) -> V
     camera = look_at(middle + distance * away, middle)
     fine = Camera(camera.T_world_camera, camera.fovy, 2 * camera.width, 2 * camera.height)
     image = depth_image(cell.model, data, fine)
-    rays = _four(image.depth)
+    rays = four_rays(image.depth)
     spread = np.ptp(np.where(rays > 0, rays, 1e3), axis=-1)
     hit = (rays > 0).all(axis=-1)
     depth = np.where(hit, rays.mean(axis=-1) + noise * rng.normal(size=hit.shape), 0.0)
-    own = _four(image.mask(cell.model, OBJECT)).all(axis=-1) & (spread <= SPREAD)
+    own = four_rays(image.mask(cell.model, OBJECT)).all(axis=-1) & (spread <= SPREAD)
     rows, columns = np.nonzero(own)
     pixels = np.stack([columns, rows, np.ones(len(rows))], axis=1)
     seen = pixels @ np.linalg.inv(camera.intrinsics).T * rays[rows, columns].mean(axis=-1)[:, None]
@@ -144,8 +146,8 @@ def measure(view: View) -> dict[str, float]:
     points, rows, columns = _points(view)
     cluster = separate_objects(points, camera=T[:3, 3])
     inside = np.zeros(view.depth.shape, bool)
-    largest = max(cluster, key=lambda one: int(view.own[rows, columns][_rows_of(points, one)].sum()))
-    chosen = _rows_of(points, largest)
+    largest = max(cluster, key=lambda one: int(view.own[rows, columns][rows_of(points, one)].sum()))
+    chosen = rows_of(points, largest)
     inside[rows[chosen], columns[chosen]] = True
     kept = np.zeros(view.depth.shape, bool)
     kept[rows, columns] = True
@@ -167,11 +169,6 @@ def measure(view: View) -> dict[str, float]:
     }
 
 
-def _four(values):
-    """The four rays of every pixel, (height, width, 4)."""
-    return np.stack([values[::2, ::2], values[1::2, ::2], values[::2, 1::2], values[1::2, 1::2]], axis=-1)
-
-
 def _points(view: View):
     """Points of an image, and their rows and columns: the noise makes all coordinates different."""
     camera = view.camera
@@ -180,12 +177,6 @@ def _points(view: View):
     pixels = (points @ T[:3, :3].T + T[:3, 3]) @ camera.intrinsics.T
     columns, rows = np.round(pixels[:, :2] / pixels[:, 2:]).astype(int).T
     return points, rows, columns
-
-
-def _rows_of(points, cluster):
-    """Which points are in a cluster of some of them."""
-    row = np.dtype([("", points.dtype)] * 3)
-    return np.isin(np.ascontiguousarray(points).view(row)[:, 0], np.ascontiguousarray(cluster).view(row)[:, 0])
 
 
 def _share(part, whole) -> float:

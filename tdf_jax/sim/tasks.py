@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.cases import SEED_SPACE
-from tdf_jax.evaluation.relation_tasks import CONTACT_QUERIES, CONTACT_SIZE, RELATIONS, TILT, draw_pair, moved
+from tdf_jax.evaluation.relation_tasks import CONTACT_QUERIES, CONTACT_SIZE, RELATIONS, TILT, draw_pair
+from tdf_jax.evaluation.tabletop import moved
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.paths import hang_on_rack, lift_over
