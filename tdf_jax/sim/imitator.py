@@ -16,6 +16,7 @@ from tdf_jax.sim.condition import (
     DEMONSTRATIONS,
     EVEN,
     ICP,
+    LIBRARY,
     NETWORKS,
     PAPER,
     REPLAY,
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from tdf_jax.sim.scans import Scan
     from tdf_jax.sim.workcell import Workcell
 
-FORMAT = 10  # format number; raise it when what is drawn or imitated changes
+FORMAT = 11  # format number; raise it when what is drawn or imitated changes
 FIRST_DEMONSTRATION = 1_000_000  # their numbers begin here, so that no episode shares their objects
 POINTS = 1500  # of a complete cloud
 VIEWED = 4000  # most points of a cloud of cameras: the field takes a subsample
@@ -211,7 +212,7 @@ class Imitator:
     def found(self, episode: Episode, shown: int) -> Found:
         """What is imitated in an episode: kept, or computed and kept.
 
-        Teleported and executed episodes, of whatever mass, share it.
+        Teleported and executed episodes, of whatever mass, share what is imitated, centred or not.
 
         Args:
             episode: the episode.
@@ -221,41 +222,49 @@ class Imitator:
             NotDrawn: there is no demonstration.
             InputError: something is wrong with the weights.
         """
-        shared = self.condition._replace(mode="", mass=0.0)
+        condition = self.condition
+        method = LIBRARY if condition.method == UNCENTRED else condition.method
+        shared = condition._replace(mode="", mass=0.0, method=method)
         about = ["imitation", *self.depends_on(episode.number), *shared]
-        result = kept("tdf simulate", self.settings.folder, about, lambda: self._found(episode, shown)._asdict())
-        return Found(result["paths"], result["motion"], result["reason"].item(), float(result["seconds"]))
+        result = kept("tdf simulate", self.settings.folder, about, lambda: self._found(episode, shown))
+        paths, points = result["paths"], result["points"]
+        if condition.method not in (TRUTH, UNCENTRED):
+            centred = [centred_path(path, points, episode.grip.opening, self.robot) for path in paths]
+            paths = np.array(centred).reshape(paths.shape)
+        return Found(paths, result["motion"], result["reason"].item(), float(result["seconds"]))
 
-    def _found(self, episode: Episode, shown: int) -> Found:
+    def _found(self, episode: Episode, shown: int) -> dict[str, Any]:
+        """Arrays to keep: those of `Found`, not centred, and the object's cloud."""
         if self.condition.method in NETWORKS:
             self.reference(shown)  # what is wrong with the weights is no failure of an episode, and ends the campaign
+        paths, points, motion, reason = np.zeros((0, 0, 4, 4)), np.zeros((0, 3)), np.eye(4), ""
         began = time.perf_counter()
         try:
-            paths, motion = self.imitated(episode, shown)
+            paths, points, motion = self.imitated(episode, shown)
         except NotDrawn:  # of the demonstrations
             raise
         except InputError as error:
-            return Found(np.zeros((0, 0, 4, 4)), np.eye(4), str(error), time.perf_counter() - began)
-        return Found(np.array(paths), motion, "", time.perf_counter() - began)
+            reason = str(error)
+        seconds = time.perf_counter() - began
+        return {"paths": np.array(paths), "points": points, "motion": motion, "reason": reason, "seconds": seconds}
 
-    def imitated(self, episode, shown: int) -> tuple[Sequence[np.ndarray], np.ndarray]:
-        """Trajectories of the gripper, the best first, and the motion of the object, by the condition's method.
+    def imitated(self, episode: Episode, shown: int) -> tuple[Sequence[np.ndarray], np.ndarray, np.ndarray]:
+        """Trajectories of the gripper, the best first, the object's cloud, and the motion of the object.
+
+        Of the true ones no cloud is needed, and it is empty.
 
         Raises:
             InputError: there are none, or a cloud is empty or too small.
         """
         from tdf_jax.sim.tasks import demonstrate_episode
 
-        condition = self.condition
-        true = episode.T_world_target @ episode.T_target_object @ np.linalg.inv(episode.T_world_object)
-        if condition.method == TRUTH:
+        if self.condition.method == TRUTH:
             path = demonstrate_episode(episode, self.settings.seed).trajectory
-            return [np.asarray(path.matrices, float)], true
+            motion = episode.T_world_target @ episode.T_target_object @ np.linalg.inv(episode.T_world_object)
+            return [np.asarray(path.matrices, float)], np.zeros((0, 3)), motion
         points, target_points = self.clouds(episode)
         paths, motion = self.replay(episode.number, points, target_points, shown)
-        if condition.method != UNCENTRED:
-            paths = [centred_path(path, points, episode.grip.opening, self.robot) for path in paths]
-        return paths, motion
+        return paths, points, motion
 
     def clouds(self, episode) -> tuple[np.ndarray, np.ndarray | None]:
         """Clouds of the object and of a target that is found, (points, 3) each, metres, world frame."""

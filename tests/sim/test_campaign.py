@@ -12,7 +12,18 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.sim import campaign
 from tdf_jax.sim.bodies import Body
 from tdf_jax.sim.campaign import run_campaign, run_one
-from tdf_jax.sim.condition import LIBRARY, METHODS, REPLAY, TRUTH, Condition, Settings, check_condition, check_settings
+from tdf_jax.sim.condition import (
+    EVEN,
+    LIBRARY,
+    METHODS,
+    REPLAY,
+    TRUTH,
+    UNCENTRED,
+    Condition,
+    Settings,
+    check_condition,
+    check_settings,
+)
 from tdf_jax.sim.episode import Outcome
 from tdf_jax.sim.imitator import Imitator, centred_path
 from tdf_jax.sim.recording import check_film
@@ -89,7 +100,7 @@ def test_every_method_gives_a_path_and_a_motion(robot, tmp_path, method):
     episode, shown = imitator.episode(4)
     assert episode.object_body.mass == 0.01 and shown == 4
     np.testing.assert_array_equal(episode.T_world_target, imitator.shown(4)[0].T_world_target)
-    paths, motion = imitator.imitated(episode, shown)
+    paths, motion = imitator.found(episode, shown)[:2]
     for T in (*paths[0], motion):
         np.testing.assert_allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-4)
     # The gripper moves with the object from the pick to the release.
@@ -107,6 +118,7 @@ def imitator(tmp_path, monkeypatch):
     episode = types.SimpleNamespace(
         **{"number": 0, "rejected": 0, "redrawn": 0, "object": shape, "target": shape, "T_target_object": np.eye(4)},
         **{"object_body": body, "target_body": body, "T_world_object": starts[0], "T_world_target": starts[1]},
+        grip=types.SimpleNamespace(opening=0.05),
     )
     monkeypatch.setattr(Imitator, "episode", lambda self, number: (episode, 0))
     monkeypatch.setattr("tdf_jax.sim.robot.load_robot", lambda *about: None)
@@ -174,7 +186,7 @@ def test_the_times_of_an_episode_are_apart(imitator, monkeypatch):
 
     def imitated(self, episode, shown):
         now[0] += 2
-        return [np.eye(4)[None]], np.eye(4)
+        return [np.eye(4)[None]], np.zeros((0, 3)), np.eye(4)
 
     def run_episode(episode, robot, candidates, watch, planned):
         now[0] += 4
@@ -184,7 +196,7 @@ def test_the_times_of_an_episode_are_apart(imitator, monkeypatch):
 
     monkeypatch.setattr(Imitator, "imitated", imitated)
     monkeypatch.setattr("tdf_jax.sim.episode.run_episode", run_episode)
-    made = imitator()
+    made = imitator(method=UNCENTRED)
     monkeypatch.setattr(campaign, "load_imitator", lambda settings: made)
     run = run_one(made.settings, 0)
     assert run.seconds == (2.0, 12.0) and run.planning == 4.0
@@ -224,10 +236,10 @@ def test_a_demonstration_that_cannot_be_drawn_is_tried_once(imitator, monkeypatc
 
 def test_what_was_imitated_is_kept(imitator, monkeypatch):
     paths, motion = np.random.default_rng(0).normal(size=(2, 3, 4, 4)), np.diag([1.0, 1, 1, 1])
-    monkeypatch.setattr(Imitator, "imitated", lambda self, episode, shown: (list(paths), motion))
+    monkeypatch.setattr(Imitator, "imitated", lambda self, episode, shown: (list(paths), np.zeros((0, 3)), motion))
     far = Outcome.failure("unreachable", "far")
     monkeypatch.setattr("tdf_jax.sim.episode.run_episode", lambda *arguments, **keywords: far)
-    made = imitator()
+    made = imitator(method=UNCENTRED)
     monkeypatch.setattr(campaign, "load_imitator", lambda settings: made)
     assert run_one(made.settings, 0).outcome.cause == "unreachable"
     monkeypatch.setattr(Imitator, "imitated", lambda *about: pytest.fail("it is imitated again"))
@@ -237,17 +249,20 @@ def test_what_was_imitated_is_kept(imitator, monkeypatch):
 
 
 def test_modes_and_masses_share_what_is_imitated(imitator, monkeypatch):
-    """Its time is that of when it was computed; another method imitates again."""
+    """Centred or not; its time is that of when it was computed; another method imitates again."""
     calls = []
 
     def imitated(self, episode, shown):
         calls.append(self.condition)
-        return [np.eye(4)[None]], np.eye(4)
+        return [np.eye(4)[None]], np.zeros((0, 3)), np.eye(4)
 
     monkeypatch.setattr(Imitator, "imitated", imitated)
-    conditions = [{"mode": "execute"}, {"mode": "teleport", "mass": 0.01}, {"method": "even blending"}]
-    seconds = [imitator(**change).found(imitator(**change).episode(0)[0], 0).seconds for change in conditions]
-    assert len(calls) == 2 and seconds[0] == seconds[1]
+    monkeypatch.setattr("tdf_jax.sim.imitator.centred_path", lambda path, *about: path + 1)
+    light = {"mode": "teleport", "mass": 0.01, "method": LIBRARY}
+    conditions = [{"mode": "execute", "method": UNCENTRED}, light, {"method": EVEN}]
+    found = [imitator(**change).found(imitator(**change).episode(0)[0], 0) for change in conditions]
+    assert len(calls) == 2 and found[0].seconds == found[1].seconds
+    np.testing.assert_array_equal(found[1].paths, found[0].paths + 1)
 
 
 def test_a_found_target_needs_weights_and_meshes_their_folder(tmp_path):
