@@ -65,8 +65,8 @@ def imitate(
             world frame, which are merged.
         target_points: point cloud of the new target, (points, 3), metres, world frame, if the demonstration has one.
             Without it the demonstrated target has not moved, and the object is placed there.
-        target_model: network of the targets; by default `model`. A demonstrated target that has not moved needs none;
-            with one the object is seated by the fields of both.
+        target_model: network of the targets, the one that described a `Reference`; by default `model`. A demonstrated
+            target that has not moved needs none; with one the object is seated by the fields of both.
         key: random key, such as `jax.random.key(0)`; the result is a function of it.
         goal: pose at the release, (7,), T_world_query as `wxyz_xyz`; by default, with `fix_last`, the demonstration's,
             moved by the centroids. Poses after the release follow it rigidly.
@@ -86,10 +86,12 @@ def imitate(
         The result; `.trajectory` is the best trajectory, T_world_query.
 
     Raises:
-        InputError: bad points, goal, offset or settings, or an energy that `carry` would not use.
+        InputError: bad points, goal, offset or settings, an energy that `carry` would not use, no target points where
+            the demonstrated targets differ, or a `Reference` whose target was described by another network.
 
     Warns:
-        CategoryWarning: the object, or the target, is probably of another category than the demonstration's.
+        CategoryWarning: the object, or the target, is probably of another category than the demonstration's, or the
+            network of the object describes a demonstrated target that is probably not of its category.
         ForeignPointsWarning: see `encode`.
         ConfidenceWarning: the pick is probably wrong. Both are known for shipped weights and the default config.
         SizeWarning: see `encode`.

@@ -21,7 +21,7 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Contact, Reference, describe
 from tdf_jax.energy.residual import pick_residual
-from tdf_jax.energy.seating import overlap, touch_distance
+from tdf_jax.energy.seating import overlap, touch_distances
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration, check_apart
 from tdf_jax.geometry.registration import refine_region
@@ -34,7 +34,7 @@ from tdf_jax.networks.model import Model
 from tdf_jax.solvers.multistart import solve
 from tdf_jax.solvers.pick import CarryConfig, carry
 from tdf_jax.solvers.result import Result, with_ends
-from tdf_jax.uncertainty.doubt import warn_of_target
+from tdf_jax.uncertainty.doubt import warn_of_one_network, warn_of_target
 from tdf_jax.uncertainty.modes import cluster_poses
 
 # Folded into the key, so that the pick is the same with and without a target. The numbers are arbitrary, but fixed:
@@ -120,8 +120,9 @@ def relate(
         points: point cloud of the new object in its initial pose, (points, 3), metres, world frame.
         target_points: point cloud of the new target, (points, 3), metres, world frame; None if the demonstrated target
             has not moved.
-        target_model: network of the target; by default `model` for a new target. A demonstrated target that has not
-            moved needs none, but with one the object is seated by the fields of both.
+        target_model: network of the target, the one that described a `Reference`; by default `model` for a new target.
+            A demonstrated target that has not moved needs none, but with one the object is seated by the fields of
+            both.
         key: random key; the result is a function of it.
         seat: lower or raise the object by up to 1.5 cm until it touches the target, if the demonstrated object touched
             its target from above; see `tdf_jax.energy.seating`.
@@ -133,11 +134,14 @@ def relate(
             pose ends at M x.
 
     Raises:
-        InputError: bad clouds, or a demonstration without a target.
+        InputError: bad clouds, clouds of one object, a demonstration without a target, no target points where the
+            demonstrated targets differ, or a `Reference` whose target was described by another network.
 
     Warns:
-        CategoryWarning: the target is probably of another category than the demonstrated one, where that is known for
-            the weights.
+        CategoryWarning: the target is probably of another category than the demonstrated one, or the weights of the
+            object describe a demonstrated target that is probably not of their category, where that is known for the
+            weights.
+        ForeignPointsWarning: the object's cloud may be a part of the target's; see `encode` too.
     """
     checks.key("relate()", key)
     reference = reference_of("relate()", model, demonstration, target_points, target_model)
@@ -170,39 +174,49 @@ def reference_of(function: str, model: Model, demonstration, target_points, targ
         The reference.
 
     Raises:
-        InputError: a new target, or a network for it, without a demonstrated one; or no new target, and several
-            demonstrations whose targets stand at different places.
+        InputError: a new target, or a network for it, without a demonstrated one; no new target, and several
+            demonstrations whose targets differ or stand at different places; or a new target, and a reference whose
+            target was described by another network.
+
+    Warns:
+        CategoryWarning: the network of the object describes the target too, and probably does not know its category.
     """
     if isinstance(demonstration, Reference):
         reference = demonstration
     else:
-        if target_points is None and isinstance(demonstration, list | tuple):
-            _check_one_target(function, demonstration)
         side = target_model if target_points is None or target_model is not None else model
         reference = describe(model, demonstration, target_model=side)
     if reference.contact is None and (target_points is not None or target_model is not None):
         raise InputError(
             f"{function}: there is a target, and the demonstration has none; expected one with target=tdf.Target(...)"
         )
-    if reference.contact is not None and target_points is not None and reference.contact.target_descriptors is None:
+    if reference.contact is not None:
+        _check_target_side(function, reference.contact, model if target_model is None else target_model, target_points)
+        warn_of_one_network(function, model.info.name, np.asarray(reference.contact.target_logits))
+    return reference
+
+
+def _check_target_side(function: str, contact: Contact, target_model: Model, target_points) -> None:
+    if target_points is None:
+        if contact.num_targets > 1:
+            raise InputError(
+                f"{function}: the demonstrations have {contact.num_targets} targets, which differ or stand at "
+                "different places, and there are no target_points: it is not known which of them stands there; "
+                "expected target_points, or demonstrations on one target"
+            )
+        return
+    if contact.target_descriptors is None:
         raise InputError(
             f"{function}: there are target_points, and the reference does not have the target's descriptors; expected "
             "describe(model, demonstration, target_model=...)"
         )
-    return reference
-
-
-def _check_one_target(function: str, demonstrations) -> None:
-    targets = [demo.target for demo in demonstrations if getattr(demo, "target", None) is not None]
-    for other in targets[1:]:
-        if not (
-            np.array_equal(other.points, targets[0].points)
-            and np.allclose(other.T_world_contact, targets[0].T_world_contact)
-        ):
-            raise InputError(
-                f"{function}: the targets of {len(targets)} demonstrations differ, and there are no target_points: it "
-                "is not known which of them stands there; expected target_points, or demonstrations on one target"
-            )
+    described, used = contact.target_info, target_model.info
+    if described is not None and (described.name, described.source) != (used.name, used.source):
+        raise InputError(
+            f"{function}: the weights of the target are {used.name!r} ({used.source}), and its demonstration is "
+            f"described by {described.name!r} ({described.source}), whose descriptors are not comparable; expected "
+            "target_model as for describe()"
+        )
 
 
 def target_field(
@@ -252,6 +266,9 @@ def check_scene(function: str, points, target_points, reference: Reference) -> N
 
     Raises:
         InputError: the clouds show the same points or surface.
+
+    Warns:
+        ForeignPointsWarning: most of the object's points lie on the target's surface.
     """
     if reference.contact is not None:
         check_apart(function, points, reference.contact.target_points if target_points is None else target_points)
@@ -385,12 +402,7 @@ def _seated(objects: Objects, found: Relations, contact: Contact) -> Relations:
     target_points = contact.target_points if objects.target_points is None else objects.target_points
     rotations = se3.rotation(jnp.asarray(found.target_contacts))
     directions = np.asarray(rotations @ contact.down, float)
-    distances = np.array(
-        [
-            touch_distance(objects.field, objects.target, objects.points, target_points, motion, direction)
-            for motion, direction in zip(found.motions, directions, strict=True)
-        ]
-    )
+    distances = touch_distances(objects.field, objects.target, objects.points, target_points, found.motions, directions)
     kept = np.isfinite(distances) | np.isnan(distances).all()
     return dataclasses.replace(
         found,
@@ -489,15 +501,18 @@ def carry_object(
             motions, np.asarray(se3.rotation(jnp.asarray(relations.target_contacts)) @ contact.outward, float)
         )
     ]
+    # Always as many candidates, so that one compiled program carries those of every object.
+    pairs = np.arange(MAX_SOLUTIONS) % len(rows)
     trajectories = _carried(
         _dense(reference.trajectory),
         _released_contact(reference),
-        jnp.asarray(picks[rows]),
-        jnp.asarray(motions[columns]),
-        jnp.asarray(relations.target_contacts[columns]),
+        jnp.asarray(picks[rows][pairs]),
+        jnp.asarray(motions[columns][pairs]),
+        jnp.asarray(relations.target_contacts[columns][pairs]),
         contact.arrival,
-        jnp.asarray(deeper, motions.dtype)[columns],
+        jnp.asarray(np.asarray(deeper, motions.dtype)[columns][pairs]),
     )
+    trajectories = jnp.asarray(np.asarray(trajectories)[: len(rows)])
     result = dataclasses.replace(
         picked,
         trajectories=trajectories,

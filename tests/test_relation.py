@@ -18,7 +18,7 @@ from tdf_jax.evaluation.relation_success import judge
 from tdf_jax.evaluation.relation_tasks import demonstrate, draw_pair, place_pair
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.transport import BEYOND, NEAR, arrival_depth, arrival_of, carry_to_target
-from tdf_jax.uncertainty.calibration import TARGET_CURVES
+from tdf_jax.uncertainty.calibration import ONE_NETWORK_CURVES, TARGET_CURVES
 
 KEY = jax.random.key(3)
 carried_path = jax.jit(carry_to_target)
@@ -112,11 +112,11 @@ def test_a_target_that_stands_where_it_stood_needs_no_cloud(small_model, related
 def test_a_network_of_a_target_that_stands_where_it_stood_seats_the_object(small_model, related, moved, monkeypatch):
     seen = []
 
-    def touch(field, target, *rest):
+    def touch(field, target, points, target_points, motions, directions):
         seen.append(target)
-        return 0.004
+        return np.full(len(motions), 0.004)
 
-    monkeypatch.setattr("tdf_jax.relation.touch_distance", touch)
+    monkeypatch.setattr("tdf_jax.relation.touch_distances", touch)
     reference = tdf.describe(small_model, related, target_model=small_model)
     reference = dataclasses.replace(reference, contact=dataclasses.replace(reference.contact, touch=jnp.zeros(())))
     options = {"points": moved[0], "key": KEY, "config": SEARCH}
@@ -135,8 +135,7 @@ def test_motions_that_do_not_touch_the_target_are_left_out_where_others_do(monke
     found = relation.Relations(poses, poses, np.arange(4.0), np.full((4, 3), np.nan, np.float32), 0.1)
     contact = cast(Any, SimpleNamespace(touch=0.0, target_points=np.zeros((1, 3)), down=jnp.array([0.0, 0.0, -1.0])))
     objects = relation.Objects(np.zeros((1, 3)), None, cast(Any, None), None)
-    left = iter(distances)
-    monkeypatch.setattr(relation, "touch_distance", lambda *_: next(left))
+    monkeypatch.setattr(relation, "touch_distances", lambda *_: np.array(distances))
     seated = relation._seated(objects, found, contact)
     np.testing.assert_array_equal(seated.energies, np.arange(4.0)[list(kept)])
     np.testing.assert_array_equal(seated.target_contacts, poses[list(kept)])
@@ -187,6 +186,41 @@ def test_a_target_of_another_category_is_warned_of(small_model, related, moved, 
     monkeypatch.setitem(TARGET_CURVES, "small", (50.0, 0.0, 0.0))
     tdf.imitate(small_model, reference, **options)  # without a warning, which would be an error
     tdf.relate(small_model, reference, **options)
+
+
+def test_weights_that_do_not_know_the_demonstrated_target_are_warned_of(small_model, related, moved, monkeypatch):
+    options = {"points": moved[0], "target_points": moved[1], "key": KEY, "config": SEARCH}
+    reference = tdf.describe(small_model, related, target_model=small_model)
+    field, points = tdf.encode(small_model, related.target.points), related.target.points
+    logits = np.clip(np.log(field.occupancy(points)) - np.log1p(-field.occupancy(points)), -3, 3)
+    np.testing.assert_allclose(reference.contact.target_logits, [logits.mean(), np.abs(logits).mean()], atol=1e-4)
+    monkeypatch.setitem(ONE_NETWORK_CURVES, "small", (-50.0, 0.0, 0.0))
+    for call in (tdf.imitate, tdf.relate):
+        for shown in (related, reference):
+            message = rf"{call.__name__}\(\): the demonstrated target does not look like .* expected target_model"
+            with pytest.warns(tdf.CategoryWarning, match=message):
+                call(small_model, shown, **options)
+    # Another network describes the target, or none.
+    other = dataclasses.replace(small_model, info=tdf.ModelInfo("other", "random numbers"))
+    tdf.relate(small_model, related, target_model=other, **options)  # a warning would be an error
+    tdf.relate(small_model, related, **{**options, "target_points": None})
+    monkeypatch.setitem(ONE_NETWORK_CURVES, "small", (50.0, 0.0, 0.0))
+    tdf.relate(small_model, related, **options)
+
+
+def test_a_target_is_looked_for_by_the_network_that_described_it(small_model, related, moved):
+    other = dataclasses.replace(small_model, info=tdf.ModelInfo("rack", "a training run"))
+    reference = tdf.describe(small_model, related, target_model=other)
+    options = {"points": moved[0], "target_points": moved[1], "key": KEY, "config": SEARCH}
+    for call in (tdf.relate, tdf.imitate):
+        message = (
+            rf"{call.__name__}\(\): the weights of the target are 'small' .* described by 'rack' \(a training run\)"
+        )
+        with pytest.raises(InputError, match=message + ".* expected target_model as for describe"):
+            call(small_model, reference, **options)
+    assert np.isfinite(tdf.relate(small_model, reference, target_model=other, **options)).all()
+    # Of a target that has not moved the descriptors are not used.
+    assert np.isfinite(tdf.relate(small_model, reference, points=moved[0], key=KEY, config=SEARCH)).all()
 
 
 def test_a_shared_reference_gives_the_same(small_model, related, moved, result):
@@ -354,10 +388,31 @@ def test_several_demonstrations_need_a_target_that_is_known(small_model, related
     )
     moved_path = tdf.Trajectory(related.trajectory.wxyz_xyz + jnp.asarray(shift, jnp.float32))
     other = dataclasses.replace(related, points=related.points + shift[4:], trajectory=moved_path, target=elsewhere)
+    options = {"points": moved[0], "key": KEY, "config": SEARCH}
+    described = tdf.describe(small_model, (demo for demo in [related, other, related]), target_model=small_model)
+    assert described.contact.num_targets == 2
     for call in (tdf.relate, tdf.imitate):
-        with pytest.raises(InputError, match="targets of 2 demonstrations differ, and there are no target_points"):
-            call(small_model, [related, other], points=moved[0], key=KEY, config=SEARCH)
-    assert np.isfinite(tdf.relate(small_model, [related, related], points=moved[0], key=KEY, config=SEARCH)).all()
+        for several in ([related, other], described):
+            with pytest.raises(InputError, match="have 2 targets, which differ .* and there are no target_points"):
+                call(small_model, several, **options)
+    assert np.isfinite(tdf.relate(small_model, described, target_points=moved[1], **options)).all()
+    again = dataclasses.replace(target, points=np.array(target.points))  # an equal one
+    for several in (
+        [related, related],
+        tdf.describe(small_model, [related, dataclasses.replace(related, target=again)]),
+    ):
+        assert np.isfinite(tdf.relate(small_model, several, **options)).all()
+
+
+def test_traced_targets_count_as_different(small_model, related):
+    @jax.jit
+    def described(poses, points):
+        shown = dataclasses.replace(related, trajectory=tdf.Trajectory(poses))
+        target = dataclasses.replace(related.target, points=points)
+        return tdf.describe(small_model, [shown, dataclasses.replace(shown, target=target)])
+
+    points = jnp.asarray(related.target.points, jnp.float32)
+    assert described(related.trajectory.wxyz_xyz, points).contact.num_targets == 2
 
 
 def test_a_target_survives_the_file(tmp_path, related):

@@ -18,7 +18,7 @@ class ConfidenceWarning(TdfWarning):
 
 
 class ForeignPointsWarning(TdfWarning):
-    """Issued if points near an object are removed from its cloud as foreign, or so many look it that none is."""
+    """Issued if points are removed as foreign, or too many look it, or an object lies on its target's surface."""
 
 
 class SizeWarning(TdfWarning):

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import tyro
 
 from tdf_jax._internal import checks
@@ -60,7 +61,8 @@ def demonstrate(
         seed: seed of the query points and of the sampled points.
         target_object: point cloud or mesh of the object that the first one is placed on or in, as it stands at the
             release, in the unit of the points file; `tdf imitate --target-object` then finds the goal on a new one.
-        contacts: number of contact points, drawn where the two objects meet at the release.
+        contacts: number of contact points, drawn where the two objects meet at the release; the contact frame has its
+            origin in their middle, and the axes of the trajectory's frame.
     """
     command = "tdf demonstrate"
     if len(query_box) not in (1, 3):
@@ -77,7 +79,11 @@ def demonstrate(
         placed = load_points(target_object, count, scale, (seed + 1) % checks.SEEDS, drop_invalid=drop_invalid)
         moved = se3.transform(demonstration.object_motion, jnp.asarray(cloud))
         region = contact_query(moved, placed, jax.random.fold_in(jax.random.key(seed), 1), contacts)
-        demonstration = dataclasses.replace(demonstration, target=Target(placed, region))
+        # The contact frame is at its points: poses of a far one would move with every turn, and distinct solutions are
+        # told apart by the translations of their poses.
+        centre = np.asarray(region, float).mean(axis=0)
+        target = Target(placed, region - centre, np.concatenate([[1.0, 0.0, 0.0, 0.0], centre]))
+        demonstration = dataclasses.replace(demonstration, target=target)
     if num_poses is not None:
         demonstration = demonstration.resampled(num_poses)
     save_demonstration(out, demonstration)

@@ -13,13 +13,15 @@ from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import public
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.descriptors import trajectory_descriptor
+from tdf_jax.energy.residual import surface_logits
 from tdf_jax.energy.seating import touch_distance
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
+from tdf_jax.geometry.target import Target
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.geometry.transport import arrival_of
 from tdf_jax.networks.encoding import encode
-from tdf_jax.networks.model import Model
+from tdf_jax.networks.model import Model, ModelInfo
 
 COMBINATIONS = ("mean", "median")
 
@@ -39,8 +41,9 @@ COMBINATIONS = ("mean", "median")
         "arrival",
         "outward",
         "depth",
+        "target_logits",
     ],
-    meta_fields=[],
+    meta_fields=["num_targets", "target_info"],
 )
 @dataclasses.dataclass(frozen=True)
 class Contact:
@@ -64,6 +67,11 @@ class Contact:
             metres, see `tdf_jax.geometry.transport.Arrival`.
         outward: direction from the released object to where its arrival begins, contact frame, (3,).
         depth: how far the released object has to go back along it until its target is behind it, metres.
+        target_logits: mean logit of the occupancy at the points of the demonstrated target, and mean absolute logit,
+            (2,), see `tdf_jax.energy.residual.surface_logits`; infinite unless one network describes object and target.
+        num_targets: number of different targets of the demonstrations, or of places of one; traced ones count as
+            different. Where the target has not moved, it is known only if this is 1.
+        target_info: origin of the network that described the target; None if the target was not encoded.
     """
 
     query: Float[Array, "queries 3"]
@@ -78,6 +86,9 @@ class Contact:
     arrival: Float[Array, ""]
     outward: Float[Array, "3"]
     depth: Float[Array, ""]
+    target_logits: Float[Array, "2"]
+    num_targets: int
+    target_info: ModelInfo | None
 
 
 def _no_poses() -> Array:
@@ -128,8 +139,9 @@ def describe(
         combine: how the descriptors of several demonstrations are combined, channel by channel: "mean", as in NDF, or
             "median", which minimises the sum of absolute differences of eq. 2 (docs/results/benchmark.md compares
             them).
-        target_model: network that encodes the targets of the demonstrations, such as `model` itself; None leaves them
-            out, which is enough for a target that has not moved.
+        target_model: network that encodes the targets of the demonstrations: `model` itself if it knows their category;
+            None leaves them out, which is enough for a target that has not moved. `imitate` and `relate` take the same
+            one, and warn where it is `model` and probably does not know their category.
 
     Returns:
         The reference.
@@ -157,11 +169,11 @@ def describe(
     transfer, approach, retreat = (
         _relative(part.wxyz_xyz, fields[0].origin) for part in (first.transfer, first.approach, first.retreat)
     )
-    contact = _contact(demonstrations, fields, target_model, combine)
+    contact = _contact(demonstrations, fields, model, target_model, combine)
     return Reference(descriptors, Trajectory(transfer), query, approach, retreat, contact)
 
 
-def _contact(demonstrations, fields, target_model, combine) -> Contact | None:
+def _contact(demonstrations, fields, model, target_model, combine) -> Contact | None:
     """The region where object and target meet, in the fields of both."""
     targets = [demo.target for demo in demonstrations]
     if all(target is None for target in targets):
@@ -206,7 +218,36 @@ def _contact(demonstrations, fields, target_model, combine) -> Contact | None:
         jnp.asarray(arrival.length, on_object.dtype),
         jnp.asarray(arrival.outward, on_object.dtype) @ se3.rotation(T_world_contact),
         jnp.asarray(arrival.depth, on_object.dtype),
+        jnp.asarray(_target_logits(targets, target_fields, model, target_model), on_object.dtype),
+        _num_different(targets),
+        None if target_model is None else target_model.info,
     )
+
+
+def _target_logits(targets, fields, model: Model, target_model: Model | None) -> Float[np.ndarray, "2"]:
+    """See `Contact`; infinite if the targets are traced."""
+    known = not checks.traced(*jax.tree.leaves([fields, [target.points for target in targets]]))
+    if target_model is None or not known or target_model.info != model.info:
+        return np.full(2, np.inf)
+    logits = [surface_logits(field, target.points) for field, target in zip(fields, targets, strict=True)]
+    return np.mean([(one.mean(), np.abs(one).mean()) for one in logits], axis=0)
+
+
+def _num_different(targets: list[Target]) -> int:
+    different = []
+    for target in targets:
+        if not any(_is_same(target, other) for other in different):
+            different.append(target)
+    return len(different)
+
+
+def _is_same(one: Target, other: Target) -> bool:
+    """Whether two targets are one at one place."""
+    if one is other:
+        return True
+    if checks.traced(one.points, one.T_world_contact, other.points, other.T_world_contact):
+        return False
+    return np.array_equal(one.points, other.points) and np.allclose(one.T_world_contact, other.T_world_contact)
 
 
 def _touch(demonstrations, fields, target_fields) -> float:

@@ -6,12 +6,15 @@ Few points of a target are on a thin peg, and none where a handle hangs on it. B
 where its surface is between them.
 """
 
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from tdf_jax.geometry import se3
-from tdf_jax.geometry.bars import bar_points, find_bars, in_bar
+from tdf_jax.geometry.bars import Bar, bar_finder, bar_points, in_bar
 from tdf_jax.geometry.sampling import subset
 from tdf_jax.networks.field import DescriptorField
 
@@ -33,6 +36,20 @@ CLOSEST = 1e-4  # metres; nearer points weigh no more
 MARGIN = 6e-4  # metres; the surface between the tested points touches so much earlier in the median
 TINY = 1e-4  # occupancies are this far from 0 and 1 at least
 PADDING = 2048  # the points are filled up to a multiple of it, so that few programs are compiled
+
+
+class _Surface(NamedTuple):
+    """A cloud of an object in its field.
+
+    Attributes:
+        field: field of the object.
+        tree: the cloud, (points, 3), metres.
+        occupancies: occupancies of the field at the cloud's points, (points,).
+    """
+
+    field: DescriptorField
+    tree: Any
+    occupancies: Float[np.ndarray, " points"]
 
 
 def touch_distance(
@@ -60,27 +77,58 @@ def touch_distance(
             short of where the tested points touch, unless they are on a round bar of the target; NaN if they do not
             touch, or overlap still, within `REACH`.
     """
+    motions, directions = np.asarray(motion)[None], np.asarray(direction)[None]
+    return float(touch_distances(field, target, points, target_points, motions, directions)[0])
+
+
+def touch_distances(
+    field: DescriptorField,
+    target: DescriptorField | None,
+    points: Float[Array | np.ndarray, "points 3"],
+    target_points: Float[Array | np.ndarray, "target_points 3"],
+    motions: Float[Array | np.ndarray, "motions 7"],
+    directions: Float[Array | np.ndarray, "motions 3"],
+) -> Float[np.ndarray, " motions"]:
+    """`touch_distance` of several motions; what does not depend on the motion is computed once.
+
+    Args:
+        field: as for `touch_distance`.
+        target: as for `touch_distance`.
+        points: as for `touch_distance`.
+        target_points: as for `touch_distance`.
+        motions: motions of the object, (motions, 7).
+        directions: a direction for each, (motions, 3).
+
+    Returns:
+        The displacements, (motions,), metres.
+    """
     # In NumPy but for the fields: the number of points differs from call to call, and JAX would compile for each.
-    R, t = np.asarray(se3.rotation(jnp.asarray(motion)), float), np.asarray(motion, float)[4:]
-    direction, target_points = np.asarray(direction, float), np.asarray(target_points, float)
-    placed = _denser(subset(np.asarray(points, float) @ R.T + t, CLOUD))
-    target_cloud = subset(target_points, CLOUD)
-    near, target_near = _meeting(placed, _denser(target_cloud), direction)
-    if not len(near):
-        return np.nan
-    target_near, bars = _split(target_cloud, target_near)
-    if len(bars):
-        # The margin is taken off in the end, but is not needed where points are as dense as on the bars.
-        near, target_near = _meeting(placed, np.concatenate([target_near, bars + MARGIN * direction]), direction)
+    points, target_cloud = np.asarray(points, float), subset(np.asarray(target_points, float), CLOUD)
+    denser, find_near_bars = _denser(target_cloud), bar_finder(target_cloud)
+    surface = _surface(field, subset(points, CLOUD))
+    target_surface = None if target is None else _surface(target, target_cloud)
+
+    def one(motion, direction) -> float:
+        R, t = np.asarray(se3.rotation(jnp.asarray(motion)), float), np.asarray(motion, float)[4:]
+        direction = np.asarray(direction, float)
+        placed = _denser(subset(points @ R.T + t, CLOUD))
+        near, target_near = _meeting(placed, denser, direction)
         if not len(near):
             return np.nan
-    steps = np.linspace(-REACH, REACH, 2 * STEPS + 1)
-    shifts = steps[:, None, None] * direction
-    cloud = subset(np.asarray(points, float), CLOUD)
-    depths = [_depth(field, cloud, (target_near - shifts - t) @ R, OBJECT_LEVELS)]
-    if target is not None:
-        depths.append(_depth(target, target_cloud, near + shifts, TARGET_LEVELS))
-    return _first_touch(steps, np.max(depths, axis=0)) - MARGIN
+        target_near, bars = _split(target_cloud, denser, target_near, find_near_bars)
+        if len(bars):
+            # The margin is taken off in the end, but is not needed where points are as dense as on the bars.
+            near, target_near = _meeting(placed, np.concatenate([target_near, bars + MARGIN * direction]), direction)
+            if not len(near):
+                return np.nan
+        steps = np.linspace(-REACH, REACH, 2 * STEPS + 1)
+        shifts = steps[:, None, None] * direction
+        depths = [_depth(surface, (target_near - shifts - t) @ R, OBJECT_LEVELS)]
+        if target_surface is not None:
+            depths.append(_depth(target_surface, near + shifts, TARGET_LEVELS))
+        return _first_touch(steps, np.max(depths, axis=0)) - MARGIN
+
+    return np.array([one(*pair) for pair in zip(np.asarray(motions), np.asarray(directions), strict=True)])
 
 
 def overlap(
@@ -117,19 +165,25 @@ def _denser(points: np.ndarray) -> np.ndarray:
     return np.concatenate([points, (points[one] + points[other]) / 2])
 
 
-def _split(cloud: Float[np.ndarray, "points 3"], near: Float[np.ndarray, "near 3"]) -> tuple[np.ndarray, np.ndarray]:
+def _split(
+    cloud: Float[np.ndarray, "points 3"],
+    denser: Float[np.ndarray, "denser 3"],
+    near: Float[np.ndarray, "near 3"],
+    find_near_bars: Callable[[Int[np.ndarray, " seeds"]], list[Bar]],
+) -> tuple[np.ndarray, np.ndarray]:
     """The denser cloud without its round bars, and points all over these; `near` and none if it has none there.
 
     Args:
         cloud: cloud of the target.
-        near: points of its denser cloud that may meet the object; bars that go through none of them do not count.
+        denser: its denser cloud.
+        near: points of the denser cloud that may meet the object; bars that go through none of them do not count.
+        find_near_bars: finds the bars of the cloud, see `bar_finder`.
     """
     from scipy.spatial import KDTree
 
-    bars = find_bars(cloud, np.flatnonzero(KDTree(near).query(cloud)[0] == 0))
+    bars = find_near_bars(np.flatnonzero(KDTree(near).query(cloud)[0] == 0))
     if not bars:
         return near, np.empty((0, 3))
-    denser = _denser(cloud)
     replaced = np.any([in_bar(bar, denser) for bar in bars], axis=0)
     return denser[~replaced], np.concatenate([bar_points(bar, cloud) for bar in bars])
 
@@ -160,29 +214,29 @@ def _closest(count: int, index: np.ndarray, measures: np.ndarray) -> np.ndarray:
     return np.argsort(least, kind="stable")[: min(POINTS // 2, int(np.isfinite(least).sum()))]
 
 
+def _surface(field: DescriptorField, cloud: Float[np.ndarray, "points 3"]) -> _Surface:
+    from scipy.spatial import KDTree
+
+    return _Surface(field, KDTree(cloud), _occupancy(field, cloud))
+
+
 def _depth(
-    field: DescriptorField,
-    cloud: Float[np.ndarray, "points 3"],
-    x: Float[np.ndarray, "steps count 3"],
-    levels: tuple[float, float],
+    surface: _Surface, x: Float[np.ndarray, "steps count 3"], levels: tuple[float, float]
 ) -> Float[np.ndarray, " steps"]:
     """How far the deepest point is inside an object at every displacement, as a difference of logits.
 
     Args:
-        field: field of the object.
-        cloud: cloud of the object, where its field is.
+        surface: cloud of the object in its field.
         x: points at all displacements.
         levels: lowest and highest occupancy that counts as touching.
     """
-    from scipy.spatial import KDTree
-
     steps, count, _ = x.shape
-    distances, nearest = KDTree(cloud).query(x.reshape(-1, 3), min(LEVEL_POINTS, len(cloud)))
+    distances, nearest = surface.tree.query(x.reshape(-1, 3), min(LEVEL_POINTS, surface.tree.n))
     distances, nearest = distances.reshape(steps * count, -1), nearest.reshape(steps * count, -1)
     weights = 1 / np.maximum(distances, CLOSEST) ** 2
-    own = (weights * _occupancy(field, cloud)[nearest]).sum(axis=1) / weights.sum(axis=1)
+    own = (weights * surface.occupancies[nearest]).sum(axis=1) / weights.sum(axis=1)
     level = np.clip(np.where(distances[:, 0] < SEEN, own, UNSEEN_LEVEL), *levels)
-    depths = _logit(_occupancy(field, x.reshape(-1, 3))) - _logit(level)
+    depths = _logit(_occupancy(surface.field, x.reshape(-1, 3))) - _logit(level)
     return depths.reshape(steps, count).max(axis=1)
 
 

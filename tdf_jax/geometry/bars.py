@@ -1,5 +1,7 @@
 """Round bars in a cloud, such as the pegs of a rack: a cylinder through few exact points is known where no point is."""
 
+import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -48,18 +50,38 @@ def find_bars(points: Float[np.ndarray, "points 3"], seeds: Int[np.ndarray, " se
     Returns:
         The bars; none where the cloud is noisier than `TOLERANCE`, or where nothing is round and slender.
     """
+    return bar_finder(points)(seeds)
+
+
+def bar_finder(points: Float[np.ndarray, "points 3"]) -> Callable[[Int[np.ndarray, " seeds"]], list[Bar]]:
+    """`find_bars` of one cloud for several sets of seeds; the bar through a point is fitted once.
+
+    Args:
+        points: cloud, (points, 3), metres.
+
+    Returns:
+        A function from numbers of points to the bars around them.
+    """
     from scipy.spatial import KDTree
 
     tree = KDTree(points)
-    known = np.zeros(len(points), bool)
-    bars = []
-    for seed in seeds:
-        bar = None if known[seed] else _grown(points, points[tree.query_ball_point(points[seed], BALL)])
-        if bar is not None and known[bar.members].mean() < 0.5:
-            bars.append(bar)
-        if bar is not None:
-            known[bar.members] = True
-    return bars
+
+    @functools.cache
+    def grown(seed: int) -> Bar | None:
+        return _grown(points, points[tree.query_ball_point(points[seed], BALL)])
+
+    def find(seeds: Int[np.ndarray, " seeds"]) -> list[Bar]:
+        known = np.zeros(len(points), bool)
+        bars = []
+        for seed in seeds:
+            bar = None if known[seed] else grown(int(seed))
+            if bar is not None and known[bar.members].mean() < 0.5:
+                bars.append(bar)
+            if bar is not None:
+                known[bar.members] = True
+        return bars
+
+    return find
 
 
 def bar_points(bar: Bar, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "samples 3"]:

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from tdf_jax._internal.deprecation import caller_level
 from tdf_jax._internal.errors import CategoryWarning
 from tdf_jax.networks.field import DescriptorField
-from tdf_jax.uncertainty.calibration import TARGET_CURVES, recognition, surface_logit
+from tdf_jax.uncertainty.calibration import ONE_NETWORK_CURVES, TARGET_CURVES, recognition, surface_logit
 
 # Probability of the demonstration's category, or of a right pick, below which a warning is issued.
 DOUBT = 0.5
@@ -60,3 +60,29 @@ def warn_of_target(
         return
     recognised = recognition(residual, surface_logit(field, jnp.asarray(points)), TARGET_CURVES[weights])
     warn_of_category(function, "target", recognised, weights, "target_points, their unit and target_model")
+
+
+def warn_of_one_network(function: str, weights: str, target_logits: Float[np.ndarray, "2"]) -> None:
+    """Warn of a demonstrated target that the weights of the object describe, and of whose category they are not.
+
+    Args:
+        function: name that the message begins with.
+        weights: name of the object's weights.
+        target_logits: mean logit and mean absolute logit at the target's points; infinite where they are not known or
+            the target has weights of its own, see `tdf_jax.energy.reference.Contact`.
+
+    Warns:
+        CategoryWarning: the probability of the category is below `DOUBT`.
+    """
+    if weights not in ONE_NETWORK_CURVES or not np.isfinite(target_logits).all():
+        return
+    intercept, *slopes = ONE_NETWORK_CURVES[weights]
+    recognised = float(1 / (1 + np.exp(-(intercept + np.dot(slopes, target_logits)))))
+    if recognised < DOUBT:
+        warnings.warn(
+            f"{function}: the demonstrated target does not look like one of the category of the weights {weights!r}, "
+            f"which describe it too (probability {recognised:.2g}); expected target_model (--target-weights), the "
+            "weights of its category, see tdf.available_models()",
+            CategoryWarning,
+            stacklevel=caller_level(),
+        )

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
 from tdf_jax.cli.main import main
+from tdf_jax.uncertainty.calibration import ONE_NETWORK_CURVES
 
 POSES = random_poses(4, 9) + [0, 0, 0, 0, 0.3, -0.2, 0.1]
 CLOUD = random_cloud(0, 60)
@@ -69,7 +70,7 @@ def test_the_file_is_imitated(files, weights, capsys):
 
 
 @pytest.mark.slow
-def test_the_goal_is_found_on_a_second_object(files, weights, capsys):
+def test_the_goal_is_found_on_a_second_object(files, weights, capsys, monkeypatch):
     motion = composed(POSES[6], inverse(POSES[3])[None])[0]
     released = carried(motion, CLOUD)
     shelf = random_cloud(7, 60) - random_cloud(7, 60).mean(axis=0) + released.mean(axis=0) + [0, 0, -0.15]
@@ -77,14 +78,19 @@ def test_the_goal_is_found_on_a_second_object(files, weights, capsys):
     call(files, **{"target-object": files / "shelf.npy", "contacts": 8})
     demo = tdf.load_demonstration(files / "demo.npz")
     np.testing.assert_allclose(demo.target.points, shelf, atol=1e-6)
-    assert np.abs(np.mean(demo.target.query, axis=0) - (released.mean(axis=0) + [0, 0, -0.075])).max() < 0.06
+    np.testing.assert_allclose(np.mean(demo.target.query, axis=0), 0, atol=1e-6)  # the contact frame is at its points
+    np.testing.assert_allclose(demo.target.T_world_contact[:4], [1, 0, 0, 0])
+    assert np.abs(demo.target.T_world_contact[4:] - (released.mean(axis=0) + [0, 0, -0.075])).max() < 0.06
 
     np.save(files / "new.npy", random_cloud(3))
     np.save(files / "new_shelf.npy", shelf + [0.5, 0.5, 0.0])
     words = ["imitate", "--demonstration", files / "demo.npz", "--target", files / "new.npy", "--weights", weights]
     words += ["--num-starts", "8", "--out", files / "result", "--target-object", files / "new_shelf.npy"]
+    monkeypatch.setitem(ONE_NETWORK_CURVES, "small", (-50.0, 0.0, 0.0))
     main([*map(str, words)])
-    assert "object moves" in capsys.readouterr().out
+    printed = capsys.readouterr()
+    assert "object moves" in printed.out
+    assert "the demonstrated target does not look like" in printed.err and "--target-weights" in printed.err
     record = json.loads((files / "result" / "result.json").read_text())
     poses = np.asarray(tdf.load_trajectory(files / "result" / "trajectory.npz").wxyz_xyz, float)
     pick = next(mode["pick"] for mode in record["modes"])

@@ -11,6 +11,7 @@ from conftest import CARRY, composed, random_poses
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
+from tdf_jax.geometry.demonstration import check_apart
 
 POSES = random_poses(4, 9) + [0, 0, 0, 0, 0.3, -0.2, 0.1]  # as many from the grasp to the release as other tests have
 GRASP, RELEASE = 3, 6
@@ -108,3 +109,52 @@ def test_rounded_quaternions_are_accepted(recording):
     assert dataclasses.replace(recording, trajectory=tdf.Trajectory(jnp.asarray(rounded))).transfer.num_poses == 4
     with pytest.raises(InputError, match="divide each quaternion by its norm"):
         dataclasses.replace(recording, trajectory=tdf.Trajectory(jnp.asarray(POSES * [2, 2, 2, 2, 1, 1, 1])))
+
+
+# Two clouds of one object, and of two that meet
+
+
+def _cup(rng, radius, count=1500, height=0.1):
+    """Wall and floor of a cup without thickness that stands on z = 0."""
+    on_wall = rng.uniform(size=count) < 2 * height / (2 * height + radius)
+    angle, out = rng.uniform(0, 2 * np.pi, count), np.sqrt(rng.uniform(size=count))
+    out = radius * np.where(on_wall, 1.0, out)
+    return np.stack([out * np.cos(angle), out * np.sin(angle), on_wall * rng.uniform(0, height, count)], axis=1)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.002])
+@pytest.mark.parametrize("seed", range(10))
+def test_two_samples_of_one_object_are_refused(seed, noise):
+    rng = np.random.default_rng(seed)
+    one, other = (_cup(rng, 0.04) + rng.normal(0, noise, (1500, 3)) for _ in range(2))
+    with pytest.raises(InputError, match=r"f\(\): the object's points lie on the target's surface \(\d\d% of them\)"):
+        check_apart("f()", one, other)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_part_of_the_target_is_warned_of(seed):
+    rng = np.random.default_rng(seed)
+    one, other = _cup(rng, 0.04, 4000), _cup(rng, 0.04)
+    with pytest.warns(tdf.ForeignPointsWarning, match="points lie on the target's surface; check that the object's"):
+        check_apart("f()", one[one[:, 0] > 0.01], other)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.002])
+@pytest.mark.parametrize("seed", range(5))
+def test_objects_that_touch_or_stand_in_each_other_are_two(seed, noise):
+    rng = np.random.default_rng(seed)
+    board = rng.uniform(-0.25, 0.25, (3000, 3)) * [1, 1, 0]
+    plate = rng.uniform(-0.1, 0.1, (1500, 3)) * [1, 1, 0] + 0.01 * rng.integers(0, 2, (1500, 1)) * [0, 0, 1]
+    for one, target in (
+        (_cup(rng, 0.04), board),
+        (plate, board),
+        (_cup(rng, 0.03) + [0.003, 0, 0.004], _cup(rng, 0.04)),  # in the other
+        (_cup(rng, 0.04) + [0, 0, 0.1], _cup(rng, 0.04)),  # on its rim
+        (_cup(rng, 0.04) + [0.08, 0, 0], _cup(rng, 0.04)),  # beside it, wall at wall
+        (
+            _cup(rng, 0.04) + [0.03, 0, 0.02],
+            _cup(rng, 0.04),
+        ),  # through it, which is not known from an object on another
+    ):
+        one, target = (cloud + rng.normal(0, noise, cloud.shape) for cloud in (one, target))
+        check_apart("f()", one, target)  # a warning would be an error

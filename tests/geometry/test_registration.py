@@ -119,3 +119,111 @@ def test_places_along_a_peg_are_all_returned():
     assert np.abs(found[:, 1:3, 3]).max() < 0.003
     assert np.ptp(found[:, 0, 3]) > 0.02
     assert abs(found[0, 0, 3]) < 0.01  # the nearest is the first
+
+
+# What a refined pose must reach to be taken. All lengths are in half edges of the region.
+
+
+def _jack():
+    """Three unequal arms, which fit in one pose alone."""
+    arms = np.eye(3)[:, None] * np.arange(0.0, 1.5, 0.02)[:, None]
+    return np.concatenate([arms[0] - [0.7, 0, 0], arms[1, :38] + [0.2, 0, 0], arms[2, :25] - [0.4, 0, 0]])
+
+
+def _rough(cloud, height, seed=0):
+    """Two points for each of a cloud, on both sides of it: the higher, the worse they fit."""
+    sides = np.random.default_rng(seed).normal(size=cloud.shape)
+    sides *= height / np.linalg.norm(sides, axis=1, keepdims=True)
+    return np.concatenate([cloud + sides, cloud - sides])
+
+
+def _taken(demonstrated, points):
+    """Translation and number of the refined poses; None if the given one stays."""
+    found = refine_region(demonstrated, points, np.eye(4), 1.0)
+    return None if np.array_equal(found, np.eye(4)[None]) else (found[0, :3, 3], len(found))
+
+
+JACK = _jack()
+DIAGONAL = np.array([1.0, 2.0, 2.0]) / 3
+UP = np.array([0.0, 1.0, 1.0]) / np.sqrt(2)
+CLUTTER = np.random.default_rng(1).uniform(-0.06, 0.06, (12, 3))
+CORNER = CLUTTER + [0.9, -0.9, -0.9]
+
+
+@pytest.mark.parametrize(
+    ("shift", "height", "others", "is_taken"),
+    [
+        (0.60 * DIAGONAL, 0.40, None, True),  # 0.56 of the distance before, 0.20
+        (0.40 * DIAGONAL, 0.30, None, False),  # 0.65, 0.16
+        (0.80 * DIAGONAL, 0.50, None, False),  # 0.52, but 0.23
+        (1.10 * DIAGONAL, 0.50, None, True),  # 0.37, 0.23
+        (1.58 * UP, 0.75, CORNER, False),  # 0.37, but 0.32
+        (0.25 * DIAGONAL, 0.20, None, True),  # 0.67, 0.11: a short way needs less
+        (0.15 * DIAGONAL, 0.15, None, False),  # 0.80, 0.08
+    ],
+)
+def test_a_pose_is_taken_that_fits_far_better_and_well(shift, height, others, is_taken):
+    points = np.concatenate([_rough(JACK, height) + shift, np.empty((0, 3)) if others is None else others])
+    found = _taken(JACK, points)
+    assert (found is not None) == is_taken
+    if found is not None:
+        assert np.linalg.norm(found[0] - shift) < 0.2
+
+
+@pytest.mark.parametrize(("way", "is_taken"), [(0.5, True), (0.9, False)])
+def test_what_fits_a_little_better_is_taken_nearby_alone(way, is_taken):
+    """Along a rod with a flag, which alone says where the region is."""
+    rod, flag = np.arange(-4.0, 4.0, 0.02)[:, None] * [1, 0, 0], np.arange(0.1, 0.6, 0.02)[:, None] * [0, 0, 1]
+    points = np.concatenate([_rough(rod, 0.14), _rough(flag, 0.14, 1) + [way, 0, 0]])
+    found = _taken(np.concatenate([rod, flag]), points)
+    assert (found is not None) == is_taken
+    if found is not None:
+        assert np.abs(found[0] - [way, 0, 0]).max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("way", "others", "is_taken"),
+    [
+        (1.2, CLUTTER - [0.9, 0, 0], True),
+        (2.0, CLUTTER - [0.9, 0, 0], False),
+        (2.0, np.empty((0, 3)), True),  # with nothing around, any place may be the right one
+    ],
+)
+def test_a_place_far_away_is_taken_where_nothing_is_around_the_given_one(way, others, is_taken):
+    found = _taken(JACK, np.concatenate([JACK + [0, way, 0], others]))
+    assert (found is not None) == is_taken
+    if found is not None:
+        np.testing.assert_allclose(found[0], [0, way, 0], atol=0.02)
+
+
+@pytest.mark.parametrize(("beside", "is_taken"), [(1.2, False), (2.0, True)])
+def test_what_is_close_around_the_region_counts_as_around(beside, is_taken):
+    lines = np.linspace(-1, 1, 12)[:, None] * [[[0, 1, 1]], [[0, 1, -1]]]
+    lines = np.concatenate([lines[0] - [beside, 0, 0], lines[1] + [beside, 0, 0]])
+    found = _taken(JACK, np.concatenate([JACK + [0, 2.2, 0], lines]))
+    assert (found is not None) == is_taken
+
+
+@pytest.mark.parametrize(("degrees", "is_taken"), [(30, True), (50, False)])
+def test_a_pose_is_turned_by_less_than_35_degrees(degrees, is_taken):
+    """A part of the turn stays, because the given orientation has a weight."""
+    turned = JACK @ Rotation.from_euler("z", degrees, degrees=True).as_matrix().T
+    found = refine_region(JACK, turned, np.eye(4), 1.0)
+    angle = np.degrees(np.arccos(np.clip((np.trace(found[0, :3, :3]) - 1) / 2, -1, 1)))
+    assert (20 < angle < 30) if is_taken else angle == 0
+
+
+@pytest.mark.parametrize(("height", "expected"), [(0.106, [-0.15, -0.1, -0.35]), (0.16, [0, 0, 1.3])])
+def test_the_nearest_of_places_that_fit_as_well_is_taken(height, expected):
+    """Two copies: the nearer one fits 1.05 or 1.5 times worse."""
+    points = np.concatenate([_rough(JACK, height) - [0.15, 0.1, 0.35], _rough(JACK, 0.1, 1) + [0, 0, 1.3]])
+    found = _taken(JACK, points)
+    assert found is not None and np.abs(found[0] - expected).max() < 0.05
+
+
+def test_places_along_a_rod_are_returned_and_none_beside_it():
+    """On the rod others fit as well; beside it, 0.15 half edges away, three times worse."""
+    rod = np.arange(-4.0, 4.0, 0.02)[:, None] * [1, 0, 0]
+    found = refine_region(rod, _rough(rod, 0.06) + [0, 0, 0.4], np.eye(4), 1.0)
+    assert len(found) == 9
+    assert np.abs(found[:, 1:3, 3] - [0, 0.4]).max() < 0.01
