@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
 from tqdm import tqdm
 
 from tdf_jax._internal import checks, workers
@@ -20,13 +19,13 @@ from tdf_jax._internal.cache import kept
 from tdf_jax._internal.errors import InputError
 from tdf_jax.sim.condition import Condition, Settings, check_settings
 from tdf_jax.sim.episode import NOT_DRAWN, NOT_FOUND, Outcome
-from tdf_jax.sim.imitator import FIRST_DEMONSTRATION, Imitator, load_imitator, load_objects
+from tdf_jax.sim.imitator import FIRST_DEMONSTRATION, Found, Imitator, load_imitator, load_objects
 from tdf_jax.sim.tasks import Episode, NotDrawn
 
 if TYPE_CHECKING:
     from tdf_jax.sim.robot import Robot
 
-FORMAT = 1  # format number; raise it when what becomes of an imitation changes
+FORMAT = 2  # format number; raise it when what becomes of an imitation changes
 MOST_PROCESSES = 1024  # more are a mistake
 
 
@@ -194,9 +193,10 @@ def _run(imitator: Imitator, number: int, view: bool = False) -> dict:
     elif condition.mode == "execute":
         with watched(Viewer) as (watch, _):
             watch = watch if view else None
-            outcome = run_episode(episode, imitator.robot, list(found.paths), watch=watch, planned=plan_ends)
+            candidates = list(found.paths), found.openings.tolist()
+            outcome = run_episode(episode, imitator.robot, *candidates, watch=watch, planned=plan_ends)
     else:
-        outcome = teleport(episode, imitator.robot, found.paths[0, 0], found.motion)
+        outcome = teleport(episode, imitator.robot, found.paths[0, 0], found.motion, found.openings[0])
     return {
         **dataclasses.asdict(outcome),
         "rejected": episode.rejected,
@@ -206,7 +206,7 @@ def _run(imitator: Imitator, number: int, view: bool = False) -> dict:
     }
 
 
-def found_in(settings: Settings, number: int) -> tuple[Episode, "Robot", Float[np.ndarray, "_ _ 4 4"], np.ndarray]:
+def found_in(settings: Settings, number: int) -> tuple[Episode, "Robot", Found]:
     """What an episode is, and what was imitated in it: kept, or computed and kept.
 
     Args:
@@ -214,8 +214,7 @@ def found_in(settings: Settings, number: int) -> tuple[Episode, "Robot", Float[n
         number: number of the episode.
 
     Returns:
-        The episode, the robot, trajectories of the gripper from the pick to the release, (paths, poses, 4, 4), metres,
-        world frame, the best first, and the motion M of the object, 4x4.
+        The episode, the robot, and what was imitated.
 
     Raises:
         InputError: nothing is drawn or imitated.
@@ -228,7 +227,7 @@ def found_in(settings: Settings, number: int) -> tuple[Episode, "Robot", Float[n
         raise InputError(f"tdf simulate: episode {number} has no motion: {error}") from None
     if not len(found.paths):
         raise InputError(f"tdf simulate: episode {number} has no motion: {found.reason}")
-    return episode, imitator.robot, found.paths, found.motion
+    return episode, imitator.robot, found
 
 
 def film(settings: Settings, number: int, path: Path) -> Outcome:
@@ -255,9 +254,9 @@ def film_one(settings: Settings, number: int, path: Path) -> Outcome:
     from tdf_jax.sim.episode import run_episode
     from tdf_jax.sim.recording import Recorder
 
-    episode, robot, paths, _ = found_in(settings, number)
+    episode, robot, found = found_in(settings, number)
     with watched(Recorder) as (watch, recorders):
-        outcome = run_episode(episode, robot, list(paths), watch=watch)
+        outcome = run_episode(episode, robot, list(found.paths), found.openings.tolist(), watch=watch)
         if not recorders:
             raise InputError(f"tdf simulate: episode {number} has no motion to film: {outcome.detail}")
         recorders[0].save(path)

@@ -1,10 +1,13 @@
-"""Centring of a grasp on what is between the fingers: the middle and the slope of a wall or a neck, by the cloud."""
+"""Centring of a grasp on what is between the fingers: the middle and the slope of a wall, or a neck, by the cloud."""
+
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from tdf_jax.sim.grasps import NECK_CLEARANCE
+from tdf_jax.sim import necks
+from tdf_jax.sim.grasps import CLEARANCE
 from tdf_jax.sim.pads import HALF_PAD, TIPS, flush_turn, turned_about_x
 from tdf_jax.sim.robot import Fingers
 
@@ -20,13 +23,33 @@ SPREAD = 0.006  # metres along the approach that the points must span for a slop
 WALL_BESIDE, THICKEST = 0.022, 0.018
 OUTLIERS, NEAR = 2.5, 0.0004
 LEAST_OF_WALL, LEAST_OF_SIDE = 10, 6  # points for a fit, and on both sides for a taper
+MOST_OF_WALL = 0.025  # metres along the closing direction between the pads; more is no wall
 GRID = 0.001  # metres between points of the fitted surfaces
 FLUSH = 0.005  # radians; a smaller turn ends the search
 # A neck is round about an axis to this, metres, in the median; its radius is linear between levels so far apart.
-ROUND_TO, KNOTS, LEAST_OF_NECK = 0.001, 0.006, 16
+ROUND_TO, KNOTS, LEAST_OF_NECK = 0.001, 0.004, 16
 NOISE = 0.001  # metres; points further from a neck count less
 STEEPEST_NECK = np.radians(20)
+BELOW_NECK = 0.02  # metres beyond the tips; descriptors know the axis of a neck better than the height on it
+GAP = 0.008  # metres along a neck without points, beyond which is something else
+FINE, SMOOTH = 0.003, 0.2  # metres between the knots of a neck's radii, and the weight of their bends
+TOUCHED = 0.0006  # metres, as in `necks`, of widths by points
+ALONG, WORTH = 0.04, 0.03  # metres: largest movement along a neck, and the one for which pads must hold e times better
+# Sine of the tilt of a neck from which on the turn about it matters, and turns about the best one, radians.
+TILTED, OFF_PLANE = 0.02, tuple(np.radians([0.0, 5.0, -5.0]))
 FINGER, CLOSE_BY, FARTHEST = 0.010, 0.001, 0.015  # metres: thickness of a finger, clearance, and largest withdrawal
+
+
+class Centred(NamedTuple):
+    """A grasp that is centred on a cloud.
+
+    Attributes:
+        T_world_grip: pose of the gripper's frame, 4x4, metres, world frame.
+        opening: opening of the fingers before they close, metres.
+    """
+
+    T_world_grip: Float[np.ndarray, "4 4"]
+    opening: float
 
 
 def centred(
@@ -34,29 +57,51 @@ def centred(
     points: Float[np.ndarray, "points 3"],
     opening: float,
     fingers: Fingers,
-) -> Float[np.ndarray, "4 4"]:
-    """Move a grasp along its closing direction to the middle of what is between the fingers, and turn it along a wall.
+) -> list[Centred]:
+    """Centre a grasp on what is between the fingers, and open them for it.
 
-    Pads press flat on a wall that is parallel to them; on a sloping one they touch at an edge, and the object turns in
-    the hand. The turn is about the x axis, through the middle of what is between the fingers. Where that is round, such
-    as a neck, its axis is found. A wall may bend: the last turn is the one at which it is narrowest between the pads;
-    see `tdf_jax.sim.pads.flush_turn`.
+    A wall: pads press flat on one that is parallel to them; on a sloping one they touch at an edge, and the object
+    turns in the hand. So the grasp moves along its closing direction to the middle, and turns about its x axis. A wall
+    may bend: the last turn is the one at which it is narrowest between the pads; see `tdf_jax.sim.pads.flush_turn`.
+
+    A neck, round about an axis along the approach: the gripper comes along the axis, as deep as pads hold best (see
+    `tdf_jax.sim.necks`), and where the neck is tilted it closes in the vertical plane of the axis, where what it holds
+    swings least.
 
     Args:
         T_world_grip: pose of the gripper's frame, 4x4, metres, world frame.
         points: cloud of the object, (points, 3), metres, world frame.
-        opening: opening of the fingers before they close, metres.
+        opening: opening of the fingers before they close, metres, such as the demonstrated one.
         fingers: how the gripper answers to commands.
 
     Returns:
-        The pose, 4x4; as it was if too few points are between the fingers.
+        The grasp; of a tilted neck also others, turned about it, the best first. As it was if too few points are
+        between the fingers.
     """
     T = np.array(T_world_grip, float)
-    tip = fingers.tip(max(opening - 2 * NECK_CLEARANCE, 0.0))  # as far as the fingers reach once they have closed
-    neck = _along_neck(T, points, opening, tip)
-    if neck is None:
-        neck = _along_wall(T, points, opening, tip)
-    return _withdrawn(neck, points, opening, fingers.tip(opening))
+    points = np.asarray(points, float)
+    grasps = _on_neck(T, points, opening, fingers)
+    if not grasps:
+        grasps = [_on_wall(T, points, opening, fingers)]
+    return [Centred(_withdrawn(T, points, gap, fingers.tip(gap)), gap) for T, gap in grasps]
+
+
+def _on_wall(T, points, opening: float, fingers: Fingers) -> tuple[np.ndarray, float]:
+    """A grasp in the middle of the wall between the fingers and flush with it, and the opening."""
+    tip = fingers.tip(max(opening - 2 * CLEARANCE, 0.0))  # as far as the fingers reach once they have closed
+    x, y, z = _between(T, points, HALF_PAD, fingers.widest, tip)
+    if len(y) and np.ptp(y) > MOST_OF_WALL:  # a neck that is not round
+        T = T.copy()
+        T[:3, 3] += np.clip((y.min() + y.max()) / 2, -LONGEST, LONGEST) * T[:3, 1]
+        return T, min(float(np.ptp(y)) + 2 * necks.CLEARANCE, fingers.widest)
+    T = _along_wall(T, points, opening, tip)
+    x, y, z = _between(T, points, WALL_BESIDE, opening, tip)
+    if len(y) < LEAST_OF_WALL:
+        return T, opening
+    surfaces, thickness = _wall(x, y, z, tip + BEYOND)
+    if thickness > THICKEST:
+        return T, opening
+    return T, min(2 * float(np.abs(surfaces[:, 1]).max()) + 2 * CLEARANCE, fingers.widest)
 
 
 def _along_wall(T, points, opening: float, tip: float):
@@ -76,7 +121,7 @@ def _along_wall(T, points, opening: float, tip: float):
 
 def _withdrawn(T, points, opening: float, tip: float):
     """Move a grasp back along the approach until no point, such as one of a shoulder, is where the open fingers are."""
-    x, y, z = ((np.asarray(points, float) - T[:3, 3]) @ T[:3, :3]).T
+    x, y, z = ((points - T[:3, 3]) @ T[:3, :3]).T
     y = np.abs(y) - opening / 2
     struck = (np.abs(x) < HALF_PAD) & (y > -CLOSE_BY) & (y < FINGER) & (z > tip - 2 * TIPS) & (z < tip + CLOSE_BY)
     back = tip + CLOSE_BY - float(z[struck].min()) if struck.any() else 0.0
@@ -89,32 +134,105 @@ def _withdrawn(T, points, opening: float, tip: float):
 
 def _between(T, points, beside: float, opening: float, tip: float):
     """Coordinates x, y, z in the gripper's frame of the points between the fingers."""
-    x, y, z = ((np.asarray(points, float) - T[:3, 3]) @ T[:3, :3]).T
+    x, y, z = ((points - T[:3, 3]) @ T[:3, :3]).T
     inside = (np.abs(x) < beside) & (np.abs(y) < opening / 2) & (z > tip - 2 * TIPS) & (z < tip + BEYOND)
     return x[inside], y[inside], z[inside]
 
 
-def _along_neck(T, points, opening: float, tip: float):
-    """Turn and move a grasp so that the axis of a round neck is in its xz plane; None if there is no neck."""
-    for number in range(2):
-        x, y, z = _between(T, points, opening / 2, opening, tip)
-        inside = np.hypot(x, y) < opening / 2
+def _on_neck(T, points, opening: float, fingers: Fingers) -> list[tuple[np.ndarray, float]]:
+    """Grasps along the axis of a round neck, as deep as pads hold best, and their opening; none if there is no neck."""
+    held = None
+    for _ in range(2):  # again at the depth that was found, where the axis is measured
+        tip = fingers.tip(max(opening - 2 * necks.CLEARANCE, 0.0))
+        found = [_along_neck(T, points, fingers.widest, tip, beyond) for beyond in (BELOW_NECK, BEYOND)]
+        aligned, misfit = min(found, key=lambda one: one[1])
+        if not np.isfinite(misfit):
+            break
+        deepened = _deepened(aligned, points, tip, fingers)
+        if deepened is None:
+            break
+        T, opening = held = deepened
+    return [] if held is None else [(turned, opening) for turned in _about_neck(T)]
+
+
+def _deepened(T, points, tip: float, fingers: Fingers) -> tuple[np.ndarray, float] | None:
+    """A grasp along the axis of a neck, moved along it to where pads hold best, and the opening there."""
+    x, y, z = ((points - T[:3, 3]) @ T[:3, :3]).T
+    radii = np.hypot(x, y)
+    along = np.sort(z[radii < fingers.widest / 2])
+    ends = np.flatnonzero((np.diff(along) > GAP) & (along[:-1] < tip))
+    end = float(along[ends[-1] + 1 if len(ends) else 0])
+    levels = np.arange(necks.LEVEL_STEP, necks.DEPTHS[1], necks.LEVEL_STEP)
+    widths = 2 * _profile(z - end, radii, levels)
+    holds = necks.neck_holds(levels, widths, float(z.mean()) - end, fingers.widest, TOUCHED)
+    moves = [end + one.depth - fingers.tip(one.width) for one in holds]
+    reached = [number for number, move in enumerate(moves) if abs(move) < ALONG]
+    if not reached:
+        return None
+    best = max(reached, key=lambda number: holds[number].score * np.exp(-abs(moves[number]) / WORTH))
+    T = T.copy()
+    T[:3, 3] += moves[best] * T[:3, 2]
+    return T, holds[best].opening
+
+
+def _about_neck(T) -> list[np.ndarray]:
+    """A grasp, turned about its approach to where what it holds swings least, the best first."""
+    along, closing = T[2, 0], T[2, 1]  # the vertical, in the gripper's frame
+    if np.hypot(along, closing) < TILTED:
+        return [T]
+    plane = np.arctan2(-along, closing)  # from the closing direction
+    plane -= np.pi * np.round(plane / np.pi)  # the same gripper, half a turn about
+    grasps = []
+    for angle in plane + np.array(OFF_PLANE):
+        turn, (cos, sin) = np.eye(4), (np.cos(angle), np.sin(angle))
+        turn[:2, :2] = [[cos, -sin], [sin, cos]]
+        grasps.append(T @ turn)
+    return grasps
+
+
+def _profile(heights, radii, levels) -> np.ndarray:
+    """Radii at levels, linear between `KNOT` metres, of points of a round body; points off it count little."""
+    knots = np.arange(0.0, levels[-1] + FINE, FINE)
+    inside = (heights > -FINE) & (heights < knots[-1])
+    heights, radii = heights[inside], radii[inside]
+    rows = np.stack([np.interp(heights, knots, row) for row in np.eye(len(knots))], axis=1)
+    bend = SMOOTH * np.diff(np.eye(len(knots)), n=2, axis=0)
+    weights, fit = np.ones(len(radii)), np.zeros(len(knots))
+    for _ in range(10):
+        rows_of, values = (
+            np.concatenate([weights[:, None] * rows, bend]),
+            np.concatenate([weights * radii, np.zeros(len(bend))]),
+        )
+        fit = np.linalg.lstsq(rows_of, values, rcond=None)[0]
+        weights = np.sqrt(1 / np.maximum(np.abs(radii - rows @ fit), NOISE / 4))
+        weights /= weights.max()
+    return np.interp(levels, knots, fit)
+
+
+def _along_neck(T, points, widest: float, tip: float, beyond: float):
+    """Turn and move a grasp so that its approach is the axis of a round neck, and the misfit; inf if there is none."""
+    last = np.inf
+    for _ in range(2):
+        x, y, z = ((points - T[:3, 3]) @ T[:3, :3]).T
+        inside = (np.hypot(x, y) < widest / 2) & (z > tip - 2 * TIPS) & (z < tip + beyond)
         x, y, z = x[inside], y[inside], z[inside]
         if len(y) < LEAST_OF_NECK or np.ptp(z) < SPREAD:
-            return None if number == 0 else T
+            break
         centre = float(z.mean())
-        offset, slope, misfit = _axis(x, y, z - centre)
-        angle = float(np.arctan(slope))
-        if misfit > ROUND_TO or abs(angle) > STEEPEST_NECK or abs(offset) > LONGEST:
-            return None if number == 0 else T
-        T = T.copy()
-        T[:3, 3] += offset * T[:3, 1]
-        T = turned_about_x(T, -angle, centre, 0.0)
-    return T
+        at, axis, misfit = _axis(x, y, z - centre)
+        if misfit > ROUND_TO or axis[2] < np.cos(STEEPEST_NECK) or np.hypot(*at) > LONGEST:
+            break
+        across = np.cross(axis, (1.0, 0.0, 0.0))
+        across /= np.linalg.norm(across)
+        turn = np.eye(4)
+        turn[:3, :3] = np.stack([np.cross(across, axis), across, axis], axis=1)
+        turn[:3, 3] = np.array([*at, centre]) - turn[:3, :3] @ (0.0, 0.0, centre)
+        T, last = T @ turn, misfit
+    return T, last
 
 
-def _axis(x, y, z) -> tuple[float, float, float]:
-    """Offset and slope of y(z) on the axis of a round body, and the median distance of its points, metres."""
+def _axis(x, y, z) -> tuple[np.ndarray, np.ndarray, float]:
+    """Where the axis of a round body is at z = 0, (2,), its direction, (3,), and the median distance of its points."""
     levels = max(2, int(np.ptp(z) / KNOTS) + 1)
     knots = np.linspace(z.min(), z.max(), levels)
     share = np.stack([np.interp(z, knots, row) for row in np.eye(levels)], axis=1)
@@ -124,7 +242,9 @@ def _axis(x, y, z) -> tuple[float, float, float]:
 
     start = np.concatenate([[x.mean(), 0, y.mean(), 0], np.full(levels, np.hypot(x, y).mean())])
     fit = least_squares(errors, start, loss="soft_l1", f_scale=NOISE).x
-    return float(fit[2]), float(fit[3]), float(np.median(np.abs(errors(fit))))
+    fit = least_squares(errors, fit, loss="cauchy", f_scale=NOISE / 4).x  # points of the end are on no wall
+    axis = np.array([fit[1], fit[3], 1.0])
+    return fit[[0, 2]], axis / np.linalg.norm(axis), float(np.median(np.abs(errors(fit))))
 
 
 def _flush(T, points, opening: float, tip: float):

@@ -127,6 +127,7 @@ def teleport(
     robot: Robot,
     pick: Float[np.ndarray, "4 4"],
     motion: Float[np.ndarray, "4 4"],
+    opening: float | None = None,
 ) -> Outcome:
     """The protocol of NDF and R-NDF: grasp and place are tested apart, and the object is reset to where it is placed.
 
@@ -140,6 +141,7 @@ def teleport(
         robot: the robot, whose gripper floats.
         pick: pose of the gripper's frame at the pick, 4x4, metres, world frame.
         motion: motion M of the object: a point x of it ends at M x, 4x4.
+        opening: opening of the fingers before they close, metres; by default that of the true grasp.
     """
     release = motion @ pick
     grasp = test_grasp(
@@ -147,7 +149,7 @@ def teleport(
         episode.object_body,
         episode.T_world_object,
         pick,
-        episode.grip.opening,
+        episode.grip.opening if opening is None else opening,
         rotation=release[:3, :3],
         fixture=episode.fixture,
     )
@@ -167,6 +169,7 @@ def run_episode(
     episode: Episode,
     robot: Robot,
     candidates: Sequence[Float[np.ndarray, "poses 4 4"]],
+    openings: Sequence[float] | None = None,
     seed: int = 1,
     watch=None,
     planned: Callable[[], None] | None = None,
@@ -178,6 +181,8 @@ def run_episode(
         episode: the episode.
         robot: the robot.
         candidates: trajectories of the gripper's frame from the pick to the release, the best first.
+        openings: opening of the fingers before they close, of each, (candidates,), metres; by default that of the true
+            grasp.
         seed: seed of the planner.
         watch: called every few steps with the cell, the state and the phase, such as `Recorder`.
         planned: called when there is a plan, or none: the physics begins.
@@ -193,7 +198,8 @@ def run_episode(
         fixture=episode.fixture,
         fixed_target=TASKS[episode.task].fixed,
     )
-    plan = plan_motion(candidates, robot, opening=episode.grip.opening, grip=0.0, cell=cell, seed=seed)
+    openings = [episode.grip.opening] * len(candidates) if openings is None else openings
+    plan = plan_motion(candidates, robot, openings=openings, grip=0.0, cell=cell, seed=seed)
     if planned is not None:
         planned()
     wrong = _pick_error(episode, np.asarray(candidates[0][0]))

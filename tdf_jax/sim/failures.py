@@ -11,6 +11,7 @@ from tdf_jax.sim.campaign import Run, found_in, process_pool
 from tdf_jax.sim.condition import Settings
 from tdf_jax.sim.episode import NOT_FOUND, reset_cell, run_episode, settle
 from tdf_jax.sim.grasping import CLOSE, LIFT, LIFTED, FloatingHand
+from tdf_jax.sim.imitator import Found
 from tdf_jax.sim.recording import Recorder, gl_context
 from tdf_jax.sim.robot import Robot
 from tdf_jax.sim.tasks import TASKS, Episode
@@ -67,14 +68,15 @@ def picture_failures(failed: Sequence[tuple[Settings, Run]]) -> list[UInt8[np.nd
 
 def picture_one(settings: Settings, run: Run) -> UInt8[np.ndarray, "_ _ 3"]:
     """As `picture_failures`, one in this process."""
-    episode, robot, paths, motion = found_in(settings, run.number)
+    episode, robot, found = found_in(settings, run.number)
+    paths, motion, opening = found.paths, found.motion, float(found.openings[0])
     condition, outcome = settings.condition, run.outcome
     if condition.mode == "teleport":
-        views = _of_grasp(episode, robot, paths[0][0]) if not outcome.grasp else _of_place(episode, motion)
+        views = _of_grasp(episode, robot, paths[0][0], opening) if not outcome.grasp else _of_place(episode, motion)
     else:
-        views = _of_execution(episode, robot, list(paths), MOMENTS.get(outcome.cause, "end"))
+        views = _of_execution(episode, robot, found, MOMENTS.get(outcome.cause, "end"))
         if not views:
-            views = _of_plan(episode, robot, paths[0], motion)
+            views = _of_plan(episode, robot, paths[0], motion, opening)
     what = f"{run.instance or 'object'} of episode {run.number}"
     return _captioned(
         [view for _, view in views],
@@ -108,7 +110,7 @@ def failure_sheet(pictures: Sequence[UInt8[np.ndarray, "_ _ 3"]]) -> bytes:
     return content.getvalue()
 
 
-def _of_execution(episode: Episode, robot: Robot, paths, moment: str) -> list[tuple[str, np.ndarray]]:
+def _of_execution(episode: Episode, robot: Robot, found: Found, moment: str) -> list[tuple[str, np.ndarray]]:
     """The fingers closed, and a moment of what follows; none if no motion was planned."""
     seen: dict[str, np.ndarray] = {}
 
@@ -117,25 +119,25 @@ def _of_execution(episode: Episode, robot: Robot, paths, moment: str) -> list[tu
             place = cell.gripper_pose(data) if word != "end" else cell.body_pose(data, TARGET)
             seen[word] = _view(cell, data, place[:3, 3], CLOSE_BY if word == "closed" else AROUND)
 
-    run_episode(episode, robot, paths, noted=noted)
+    run_episode(episode, robot, list(found.paths), found.openings.tolist(), noted=noted)
     return [(WORDS[word], seen[word]) for word in ("closed", moment) if word in seen]
 
 
-def _of_plan(episode: Episode, robot: Robot, path, motion) -> list[tuple[str, np.ndarray]]:
+def _of_plan(episode: Episode, robot: Robot, path, motion, opening: float) -> list[tuple[str, np.ndarray]]:
     """The hand alone at a pick, and at its release with the object where it goes."""
     views = []
     for words, grip, T_object in (
         ("the pick", path[0], episode.T_world_object),
         ("the release", path[-1], motion @ episode.T_world_object),
     ):
-        cell, hand = _floating(episode, robot, grip, T_object)
+        cell, hand = _floating(episode, robot, grip, T_object, opening)
         views.append((words, _view(cell, hand.data, T_object[:3, 3], CLOSE_BY)))
     return views
 
 
-def _of_grasp(episode: Episode, robot: Robot, pick) -> list[tuple[str, np.ndarray]]:
+def _of_grasp(episode: Episode, robot: Robot, pick, opening: float) -> list[tuple[str, np.ndarray]]:
     """The hand alone at the pick, and after it has closed and lifted the object."""
-    cell, hand = _floating(episode, robot, pick, episode.T_world_object)
+    cell, hand = _floating(episode, robot, pick, episode.T_world_object, opening)
     before = _view(cell, hand.data, pick[:3, 3], CLOSE_BY)
     hand.close(0.0, CLOSE)
     if episode.fixture:
@@ -156,7 +158,7 @@ def _of_place(episode: Episode, motion) -> list[tuple[str, np.ndarray]]:
     return [("reset", before), ("2 s later", _view(cell, data, middle, AROUND))]
 
 
-def _floating(episode: Episode, robot: Robot, grip, T_object) -> tuple[Workcell, FloatingHand]:
+def _floating(episode: Episode, robot: Robot, grip, T_object, opening: float) -> tuple[Workcell, FloatingHand]:
     cell = build_workcell(
         robot,
         episode.object_body,
@@ -167,7 +169,7 @@ def _floating(episode: Episode, robot: Robot, grip, T_object) -> tuple[Workcell,
         fixture=episode.fixture,
         fixed_target=TASKS[episode.task].fixed,
     )
-    return cell, FloatingHand(cell, np.asarray(grip, float), episode.grip.opening)
+    return cell, FloatingHand(cell, np.asarray(grip, float), opening)
 
 
 def _view(cell: Workcell, data: Any, centre: Float[np.ndarray, "3"], distance: float) -> np.ndarray:

@@ -9,22 +9,13 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.geometry.symmetry import ROUND
 from tdf_jax.shapes import Shape
-from tdf_jax.sim.pads import HALF_PAD, TIPS, flush_turn, turned_about_x
+from tdf_jax.sim.necks import DEPTHS, LEVEL_STEP, neck_holds
+from tdf_jax.sim.pads import HALF_PAD, flush_turn, turned_about_x
 from tdf_jax.sim.robot import Fingers
 
 CLEARANCE = 0.018  # metres between each finger and the wall before closing
-NECK_CLEARANCE, LEAST_CLEARANCE = 0.010, 0.005  # of a neck, whose middle the cloud shows well
 RIM_DEPTH = 0.030  # metres from the rim down the wall to the tips of the fingers
 MOST_DEPTH = 0.6  # of the height of a low bowl
-NECK_DEPTHS = (0.012, 0.052)  # metres from a bottle's top to the tips; the palm is 0.055 m behind them
-LEVEL_STEP = 0.001  # metres between levels at which a neck is measured
-TOUCHED = 0.0003  # metres: pads touch where the width is the largest between them, up to this
-# Metres from the tips within which pads slide off a slope, and beyond which the fingers of the 2F-85, which adapt to
-# what they enclose, give way; and the share that a grasp is worth there.
-EDGE, UNSTEADY, AT_EDGE = 0.005, 0.009, 0.3
-STEEP = 0.4  # radius over length of a slope on which the tips do not hold at all
-NEAR = 0.020  # metres between pads and centre of mass, below which nearer is no better
-RECESS = 0.003  # metres by which the fingers are further apart behind the pads
 DIRECTIONS, ROUND_TOLERANCE = (
     24,
     0.0015,
@@ -109,37 +100,22 @@ def _wall(shape: Shape, rim, level: float) -> tuple[np.ndarray, float]:
 def _neck_grip(shape: Shape, fingers: Fingers) -> Grip:
     """From above, closing along the y axis, which is any direction where the neck and all above it are round.
 
-    Pads are flat, and touch a cone at its widest ring only. Of all depths the one is taken at which what the pads touch
-    is long, wide and near the centre of mass, and lies within the pads: their tips would slide off a slope.
+    Of all depths the one is taken at which they hold best; see `tdf_jax.sim.necks`.
     """
     mesh = shape.mesh
     top, centre = float(mesh.bounds[1, 2]), float(mesh.center_mass[2])
-    levels = np.arange(LEVEL_STEP, min(NECK_DEPTHS[1], 0.8 * shape.height), LEVEL_STEP)  # below the top
+    levels = np.arange(LEVEL_STEP, min(DEPTHS[1], 0.8 * shape.height), LEVEL_STEP)  # below the top
     widths, spreads = _widths(mesh, top - levels)
-    found = []
-    for tips in np.flatnonzero(levels >= NECK_DEPTHS[0]):
-        depth, inserted = levels[tips], widths[: tips + 1]
-        pads = levels[: tips + 1] > depth - 2 * TIPS
-        width = float(inserted[pads].max())
-        clearance = min(NECK_CLEARANCE, (fingers.widest - float(inserted.max())) / 2)
-        if clearance < LEAST_CLEARANCE or inserted.max() > width + RECESS:
-            continue
-        touched = levels[: tips + 1][pads & (inserted > width - TOUCHED)]
-        length, lever = float(np.ptp(touched)), abs(top - float(touched.mean()) - centre)
-        score = (width + 2 * length) / max(lever, NEAR)
-        if depth - touched.mean() < EDGE:
-            slope = float(inserted[-1] - inserted[max(0, tips - 3)]) / (6 * LEVEL_STEP)
-            score *= AT_EDGE * min(max(1 - slope / STEEP, 0.01), 1)
-        elif depth - touched.max() > UNSTEADY:
-            score *= AT_EDGE
-        is_round = bool((spreads[: tips + 1] < ROUND_TOLERANCE).all())
-        found.append((is_round, score, depth, width, float(inserted.max()) + 2 * clearance))
-    if not found:
+    holds = neck_holds(levels, widths, top - centre, fingers.widest)
+    if not holds:
         raise InputError(f"grip_of(): the neck of the bottle is wider than the gripper, {1e3 * fingers.widest:.0f} mm")
-    is_round, _, depth, width, opening = max(found)
+    is_round, best = max(
+        ((bool((spreads[levels <= one.depth] < ROUND_TOLERANCE).all()), one) for one in holds),
+        key=lambda pair: (pair[0], pair[1].score),
+    )
     T = np.diag([-1.0, 1.0, -1.0, 1.0])
-    T[2, 3] = top - (depth - fingers.tip(width))
-    return Grip(T, width, opening, ROUND if is_round else 1)
+    T[2, 3] = top - (best.depth - fingers.tip(best.width))
+    return Grip(T, best.width, best.opening, ROUND if is_round else 1)
 
 
 def _widths(mesh, heights) -> tuple[np.ndarray, np.ndarray]:

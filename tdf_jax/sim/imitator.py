@@ -47,12 +47,14 @@ class Found(NamedTuple):
     Attributes:
         paths: trajectories of the gripper from the pick to the release, (paths, poses, 4, 4), metres, world frame, the
             best first; none if nothing is found.
+        openings: opening of the fingers before they close, (paths,), metres.
         motion: motion M of the object: a point x of it ends at M x, 4x4.
         reason: why nothing is found, in words; empty if something is.
         seconds: time that it took when it was computed, without that of describing the demonstration.
     """
 
     paths: Float[np.ndarray, "paths poses 4 4"]
+    openings: Float[np.ndarray, " paths"]
     motion: Float[np.ndarray, "4 4"]
     reason: str
     seconds: float
@@ -75,20 +77,29 @@ def load_objects(settings: Settings) -> "list[Scan]":
     return load_scans("tdf simulate", settings.meshes, settings.recursive, category)
 
 
-def centred_path(
+def centred_paths(
     path: Float[np.ndarray, "poses 4 4"], points: Float[np.ndarray, "points 3"], opening: float, robot: "Robot"
-) -> Float[np.ndarray, "poses 4 4"]:
-    """A path whose pick is centred on the cloud; see `tdf_jax.sim.centring`. The object moves as before.
+) -> list[tuple[Float[np.ndarray, "poses 4 4"], float]]:
+    """Paths whose pick is centred on the cloud, and their openings; see `tdf_jax.sim.centring`.
+
+    The object moves as before.
 
     Args:
         path: poses of the gripper's frame from the pick to the release, (poses, 4, 4).
         points: cloud of the object at the pick, (points, 3), metres, world frame.
-        opening: opening of the fingers before they close, metres.
+        opening: demonstrated opening of the fingers before they close, metres.
         robot: the robot.
+
+    Returns:
+        One path or several, the best first, and the opening of each, metres.
     """
     from tdf_jax.sim.centring import centred
 
-    return path @ (np.linalg.inv(path[0]) @ centred(path[0], points, opening, robot.fingers))
+    back = np.linalg.inv(path[0])
+    return [
+        (path @ (back @ grasp.T_world_grip), grasp.opening)
+        for grasp in centred(path[0], points, opening, robot.fingers)
+    ]
 
 
 @functools.lru_cache(maxsize=1)
@@ -227,11 +238,22 @@ class Imitator:
         shared = condition._replace(mode="", mass=0.0, method=method)
         about = ["imitation", *self.depends_on(episode.number), *shared]
         result = kept("tdf simulate", self.settings.folder, about, lambda: self._found(episode, shown))
-        paths, points = result["paths"], result["points"]
-        if condition.method not in (TRUTH, UNCENTRED):
-            centred = [centred_path(path, points, episode.grip.opening, self.robot) for path in paths]
-            paths = np.array(centred).reshape(paths.shape)
-        return Found(paths, result["motion"], result["reason"].item(), float(result["seconds"]))
+        return self._opened(episode, shown, result)
+
+    def _opened(self, episode: Episode, shown: int, result: dict[str, np.ndarray]) -> Found:
+        """What is imitated, with the fingers opened by the cloud, and centred by the condition's method."""
+        paths, method = result["paths"], self.condition.method
+        if method == TRUTH or not len(paths):
+            openings = np.full(len(paths), episode.grip.opening)
+        else:
+            demonstrated = self.shown(max(shown, 0))[0].grip.opening
+            centred = [centred_paths(path, result["points"], demonstrated, self.robot) for path in paths]
+            if method == UNCENTRED:
+                openings = np.array([several[0][1] for several in centred])
+            else:
+                openings = np.array([opening for several in centred for _, opening in several])
+                paths = np.array([path for several in centred for path, _ in several])
+        return Found(paths, openings, result["motion"], result["reason"].item(), float(result["seconds"]))
 
     def _found(self, episode: Episode, shown: int) -> dict[str, Any]:
         """Arrays to keep: those of `Found`, not centred, and the object's cloud."""

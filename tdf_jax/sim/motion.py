@@ -120,7 +120,7 @@ def plan_joints(
             f"{robot.fingers.widest:.4f} m, the widest opening of {robot.name}"
         )
     poses = np.asarray(trajectory.matrices, float)
-    plan = plan_motion([poses], robot, opening=wide, grip=grip, cell=cell, approach=approach, seed=seed)
+    plan = plan_motion([poses], robot, openings=[wide], grip=grip, cell=cell, approach=approach, seed=seed)
     if isinstance(plan, Failure):
         raise InputError(f"plan_joints(): there is no motion: {plan.reason}")
     return plan.motion
@@ -130,7 +130,7 @@ def plan_motion(
     candidates: Sequence[Float[np.ndarray, "poses 4 4"]],
     robot: Robot,
     *,
-    opening: float,
+    openings: Sequence[float],
     grip: float,
     cell: Workcell | None = None,
     approach: float = APPROACH,
@@ -142,7 +142,7 @@ def plan_motion(
         candidates: trajectories of the gripper's frame, the best first, (poses, 4, 4) each. Each is tried as it is and
             turned by half a turn about the approach, which is the same for a parallel gripper.
         robot: the robot.
-        opening: opening before the grasp and after the release, metres.
+        openings: opening before the grasp and after the release of each, (candidates,), metres.
         grip: opening that is commanded to hold, metres.
         cell: the cell to stay clear of.
         approach: length of the straight motions before the pick and after the release, metres.
@@ -155,7 +155,7 @@ def plan_motion(
     collisions = None if cell is None else Collisions(cell)
     postures = Postures(kinematics)
     reasons: list[tuple[int, str]] = []
-    for number, poses in enumerate(candidates):
+    for number, (poses, opening) in enumerate(zip(candidates, openings, strict=True)):
         for half, share in itertools.product((np.eye(4), HALF_TURN), SHORTER):
             turned = np.asarray(poses, float) @ half
             path = _Path(turned, share * approach)

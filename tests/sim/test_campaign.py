@@ -25,7 +25,7 @@ from tdf_jax.sim.condition import (
     check_settings,
 )
 from tdf_jax.sim.episode import Outcome
-from tdf_jax.sim.imitator import Imitator, centred_path
+from tdf_jax.sim.imitator import Imitator, centred_paths
 from tdf_jax.sim.recording import check_film
 from tdf_jax.sim.report import record
 from tdf_jax.sim.tasks import NotDrawn
@@ -125,7 +125,14 @@ def imitator(tmp_path, monkeypatch):
     monkeypatch.setattr("tdf_jax.networks.checkpoint.load_model", lambda name: name)
     monkeypatch.setattr("tdf_jax.networks.model.fingerprint", lambda model: model)
     monkeypatch.setattr(Imitator, "reference", lambda self, shown: None)
-    return lambda **change: Imitator(settings(tmp_path, SHELF._replace(**change)))
+    monkeypatch.setattr("tdf_jax.sim.imitator.centred_paths", lambda path, *about: [(path, 0.05)])
+
+    def make(**change):
+        made = Imitator(settings(tmp_path, SHELF._replace(**change)))
+        made._shown[0] = episode, None
+        return made
+
+    return make
 
 
 def result(**change):
@@ -188,7 +195,7 @@ def test_the_times_of_an_episode_are_apart(imitator, monkeypatch):
         now[0] += 2
         return [np.eye(4)[None]], np.zeros((0, 3)), np.eye(4)
 
-    def run_episode(episode, robot, candidates, watch, planned):
+    def run_episode(episode, robot, candidates, openings, watch, planned):
         now[0] += 4
         planned()
         now[0] += 8
@@ -243,9 +250,9 @@ def test_what_was_imitated_is_kept(imitator, monkeypatch):
     monkeypatch.setattr(campaign, "load_imitator", lambda settings: made)
     assert run_one(made.settings, 0).outcome.cause == "unreachable"
     monkeypatch.setattr(Imitator, "imitated", lambda *about: pytest.fail("it is imitated again"))
-    _, _, kept_paths, kept_motion = campaign.found_in(made.settings, 0)
-    np.testing.assert_array_equal(kept_paths, paths)
-    np.testing.assert_array_equal(kept_motion, motion)
+    found = campaign.found_in(made.settings, 0)[-1]
+    np.testing.assert_array_equal(found.paths, paths)
+    np.testing.assert_array_equal(found.motion, motion)
 
 
 def test_modes_and_masses_share_what_is_imitated(imitator, monkeypatch):
@@ -257,12 +264,13 @@ def test_modes_and_masses_share_what_is_imitated(imitator, monkeypatch):
         return [np.eye(4)[None]], np.zeros((0, 3)), np.eye(4)
 
     monkeypatch.setattr(Imitator, "imitated", imitated)
-    monkeypatch.setattr("tdf_jax.sim.imitator.centred_path", lambda path, *about: path + 1)
+    monkeypatch.setattr("tdf_jax.sim.imitator.centred_paths", lambda path, *about: [(path + 1, 0.07), (path, 0.06)])
     light = {"mode": "teleport", "mass": 0.01, "method": LIBRARY}
     conditions = [{"mode": "execute", "method": UNCENTRED}, light, {"method": EVEN}]
     found = [imitator(**change).found(imitator(**change).episode(0)[0], 0) for change in conditions]
     assert len(calls) == 2 and found[0].seconds == found[1].seconds
-    np.testing.assert_array_equal(found[1].paths, found[0].paths + 1)
+    np.testing.assert_array_equal(found[1].paths, [found[0].paths[0] + 1, found[0].paths[0]])
+    assert list(found[0].openings) == [0.07] and list(found[1].openings) == [0.07, 0.06]
 
 
 def test_a_found_target_needs_weights_and_meshes_their_folder(tmp_path):
@@ -306,7 +314,7 @@ def test_a_centred_path_moves_the_object_as_before(robot):
     wall = path[0] @ np.array([0, 0.004, depth, 1])
     spread = np.stack([rng.uniform(-0.01, 0.01, 60), rng.choice([-0.001, 0.001], 60), rng.uniform(-0.02, 0.02, 60)])
     points = wall[:3] + spread.T
-    centred = centred_path(path, points, 0.05, robot)
+    ((centred, _),) = centred_paths(path, points, 0.05, robot)
     assert abs(centred[0][1, 3] - path[0][1, 3]) == pytest.approx(0.004, abs=1e-3)
     for before, after in zip(path, centred):
         np.testing.assert_allclose(after @ np.linalg.inv(centred[0]), before @ np.linalg.inv(path[0]), atol=1e-9)

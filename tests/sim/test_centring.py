@@ -1,13 +1,22 @@
-"""Centring: a grasp that is turned and shifted comes back to the middle of the wall that the cloud shows."""
+"""Centring: a grasp that is turned and shifted comes back to the middle of the wall or onto the neck of the cloud."""
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from tdf_jax.geometry.sampling import sample_surface
+from tdf_jax.geometry.symmetry import ROUND
 from tdf_jax.shapes import FAMILIES
 from tdf_jax.sim.centring import centred
 from tdf_jax.sim.grasps import grip_of
+from tdf_jax.sim.necks import DEPTHS, LEVEL_STEP, neck_holds
+
+
+def shape_cloud_and_grip(category, seed, robot):
+    family = FAMILIES[category]
+    shape = family.build(family.sample(np.random.default_rng(seed)))
+    return shape, sample_surface(shape.mesh, 1500, np.random.default_rng(3)), grip_of(shape, robot.fingers)
 
 
 @pytest.fixture(
@@ -15,10 +24,21 @@ from tdf_jax.sim.grasps import grip_of
 )
 def held(request, robot):
     category, seed = request.param
-    family = FAMILIES[category]
-    shape = family.build(family.sample(np.random.default_rng(seed)))
-    cloud = sample_surface(shape.mesh, 1500, np.random.default_rng(3))
-    return cloud, grip_of(shape, robot.fingers), {"mug": (2, 1e-3), "bowl": (3, 1e-3), "bottle": (2, 0.5e-3)}[category]
+    most = {"mug": (2, 1e-3), "bowl": (3, 1e-3), "bottle": (2, 0.5e-3)}[category]
+    return *shape_cloud_and_grip(category, seed, robot)[1:], most
+
+
+@pytest.fixture(scope="module", params=range(2, 7), ids=lambda seed: f"bottle{seed}")
+def neck(request, robot):
+    """Bottles with round necks."""
+    shape, cloud, grip = shape_cloud_and_grip("bottle", request.param, robot)
+    assert grip.fold == ROUND
+    return shape, cloud, grip
+
+
+def section_of(mesh, height):
+    """Points of a horizontal section, (points, 3)."""
+    return trimesh.intersections.mesh_plane(mesh, (0, 0, 1), (0, 0, height)).reshape(-1, 3)
 
 
 def moved_grip(T, degrees, shift, fingers):
@@ -37,34 +57,83 @@ def errors(T, true, fingers):
     return abs(np.degrees(np.arctan2(local[2, 1], local[1, 1]))), abs(at[1])
 
 
+def grasp(T, cloud, grip, robot):
+    """The best of the centred grasps, 4x4."""
+    return centred(T, cloud, grip.opening, robot.fingers)[0].T_world_grip
+
+
 def test_a_grasp_that_is_turned_and_shifted_comes_back(held, robot):
     cloud, grip, (most_degrees, most_offset) = held
     for degrees, shift in ((15, 0.005), (-15, 0.005), (15, -0.005), (-15, -0.005)):
         T = moved_grip(grip.T_object_grip, degrees, shift, robot.fingers)
         assert errors(T, grip.T_object_grip, robot.fingers)[0] == pytest.approx(15)
-        angle, offset = errors(centred(T, cloud, grip.opening, robot.fingers), grip.T_object_grip, robot.fingers)
+        angle, offset = errors(grasp(T, cloud, grip, robot), grip.T_object_grip, robot.fingers)
         assert angle < most_degrees and offset < most_offset, (degrees, shift)
 
 
 def test_a_grasp_in_the_middle_stays(held, robot):
     cloud, grip, (most_degrees, most_offset) = held
-    angle, offset = errors(
-        centred(grip.T_object_grip, cloud, grip.opening, robot.fingers), grip.T_object_grip, robot.fingers
-    )
+    angle, offset = errors(grasp(grip.T_object_grip, cloud, grip, robot), grip.T_object_grip, robot.fingers)
     assert angle < most_degrees and offset < most_offset
 
 
-def test_what_moves_is_the_closing_direction_alone(held, robot):
+def test_of_a_wall_what_moves_is_the_closing_direction_alone(held, robot):
     """Along x, where the wall goes on, nothing is known."""
     cloud, grip, _ = held
+    if grip.fold == ROUND:
+        return
     T = moved_grip(grip.T_object_grip, 10, 0.003, robot.fingers)
-    local = np.linalg.inv(grip.T_object_grip) @ centred(T, cloud, grip.opening, robot.fingers)
+    local = np.linalg.inv(grip.T_object_grip) @ grasp(T, cloud, grip, robot)
     assert abs(local[0, 3]) < 1e-9
     np.testing.assert_allclose(local[0, :3], (1, 0, 0), atol=1e-9)
+
+
+def test_the_opening_is_that_of_what_the_cloud_shows(held, robot):
+    """The demonstrated one was of another wall or neck."""
+    cloud, grip, _ = held
+    (found, *_) = centred(grip.T_object_grip, cloud, 0.05, robot.fingers)
+    assert found.opening == pytest.approx(grip.opening, abs=4e-3)
+
+
+@pytest.mark.parametrize("height", [-0.012, 0.0, 0.015])
+def test_on_a_neck_a_grasp_comes_to_the_axis_and_to_where_pads_hold(neck, robot, height):
+    """Descriptors find the height on a neck to some centimetres, and its axis better."""
+    shape, cloud, grip = neck
+    T = moved_grip(grip.T_object_grip, 5, 0.004, robot.fingers)
+    T[:3, 3] += (0.004, 0, height)
+    found = grasp(T, cloud, grip, robot)
+    local = np.linalg.inv(grip.T_object_grip) @ found
+    assert np.degrees(np.arccos(local[2, 2])) < 5 and np.linalg.norm(local[:2, 3]) < 4e-3
+    # By the exact widths, pads hold there well: not at the depth from where they slide off a slope.
+    top = shape.mesh.bounds[1, 2]
+    levels = np.arange(LEVEL_STEP, DEPTHS[1], LEVEL_STEP)
+    widths = 2 * np.array([np.abs(section_of(shape.mesh, top - level)[:, :2]).max() for level in levels])
+    holds = neck_holds(levels, widths, top - shape.mesh.center_mass[2], robot.fingers.widest)
+    off = [abs(top - one.depth + robot.fingers.tip(one.width) - found[2, 3]) for one in holds]
+    near = [one.score for one, distance in zip(holds, off) if distance < 3e-3]
+    assert max(near) > 0.2 * max(one.score for one in holds)
+
+
+def test_a_tilted_neck_is_held_where_it_swings_least(neck, robot):
+    """The closing direction is in the vertical plane of the axis; other turns, a few degrees away, come after it."""
+    _, cloud, grip = neck
+    tilted = np.eye(4)
+    tilted[:3, :3] = Rotation.from_euler("xz", (40, 70), degrees=True).as_matrix()
+    found = centred(tilted @ grip.T_object_grip, cloud @ tilted[:3, :3].T, grip.opening, robot.fingers)
+    assert len(found) == 3
+    for one, most in zip(found, (0.5, 5.5, 5.5)):
+        normal = np.cross(tilted[:3, 2], (0, 0, 1))
+        normal /= np.linalg.norm(normal)
+        assert np.degrees(np.arcsin(abs(one.T_world_grip[:3, 1] @ normal))) < most
+    upright = centred(grip.T_object_grip, cloud, grip.opening, robot.fingers)
+    assert len(upright) == 1  # no turn is better, so it stays
+    np.testing.assert_allclose(upright[0].T_world_grip[:3, 1] @ grip.T_object_grip[:3, 1], 1, atol=2e-3)
 
 
 def test_with_nothing_between_the_fingers_a_grasp_stays(held, robot):
     cloud, grip, _ = held
     away = grip.T_object_grip.copy()
     away[:3, 3] += 0.5
-    np.testing.assert_array_equal(centred(away, cloud, grip.opening, robot.fingers), away)
+    (found,) = centred(away, cloud, grip.opening, robot.fingers)
+    np.testing.assert_array_equal(found.T_world_grip, away)
+    assert found.opening == grip.opening

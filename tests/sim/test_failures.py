@@ -14,6 +14,7 @@ from tdf_jax.sim.campaign import Run
 from tdf_jax.sim.condition import Condition, Settings
 from tdf_jax.sim.episode import Outcome
 from tdf_jax.sim.failures import check_renderer, failure_sheet, first_failures, picture_one
+from tdf_jax.sim.imitator import Found
 
 SHELF = Condition("bowl_on_shelf", "known", "upright", "execute")
 GOOD = Outcome(True, True, True, True, "", "", 0.0, 0.0)
@@ -68,8 +69,8 @@ def test_a_picture_has_two_views_of_the_failure(robot, drawn, renderer, monkeypa
     if cause == "unreachable":
         release[0, 3] += 3
     path = lifted(pick_beside(episode) if cause == "slipped" else episode.pick, release, 0.2)
-    motion = path[-1] @ np.linalg.inv(path[0])
-    monkeypatch.setattr(failures, "found_in", lambda settings, number: (episode, robot, path[None], motion))
+    found = Found(path[None], np.array([episode.grip.opening]), path[-1] @ np.linalg.inv(path[0]), "", 0.0)
+    monkeypatch.setattr(failures, "found_in", lambda settings, number: (episode, robot, found))
     settings = Settings(SHELF._replace(mode=mode), "bowl", None, 0, tmp_path)
     pixels = picture_one(settings, run(7, cause, settings.condition, grasp))
     height = len(pixels) - failures.HEIGHT

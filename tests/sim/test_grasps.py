@@ -9,7 +9,9 @@ import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.symmetry import ROUND
 from tdf_jax.shapes import FAMILIES
-from tdf_jax.sim.grasps import EDGE, TIPS, UNSTEADY, grip_of
+from tdf_jax.sim.grasps import grip_of
+from tdf_jax.sim.necks import EDGE, UNSTEADY
+from tdf_jax.sim.pads import TIPS
 
 
 def drawn_shape(category, seed):

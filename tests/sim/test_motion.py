@@ -92,7 +92,7 @@ def test_a_motion_around_a_scene_touches_nothing_but_what_it_may(robot, surround
     import mujoco
 
     cell, pick, release, opening = surrounded
-    plan = plan_motion([lifted(pick, release)], robot, opening=opening, grip=0.0, cell=cell)
+    plan = plan_motion([lifted(pick, release)], robot, openings=[opening], grip=0.0, cell=cell)
     assert not isinstance(plan, Failure), plan
     # The half turn of a parallel gripper is the same grasp.
     assert min(angle(plan.pick, pick), angle(plan.pick @ np.diag([-1, -1, 1, 1]), pick)) < 1e-3
@@ -136,10 +136,10 @@ def test_a_target_in_the_way_is_said_and_the_next_candidate_taken(robot, surroun
     cell, pick, release, opening = surrounded
     low = release.copy()
     low[2, 3] -= 0.1
-    plan = plan_motion([lifted(pick, low)], robot, opening=opening, grip=0.0, cell=cell)
+    plan = plan_motion([lifted(pick, low)], robot, openings=[opening], grip=0.0, cell=cell)
     assert isinstance(plan, Failure) and "collide" in plan.reason and "target" in plan.reason
     # The next candidate is taken.
-    plan = plan_motion([lifted(pick, low), lifted(pick, release)], robot, opening=opening, grip=0.0, cell=cell)
+    plan = plan_motion([lifted(pick, low), lifted(pick, release)], robot, openings=[opening] * 2, grip=0.0, cell=cell)
     assert not isinstance(plan, Failure) and plan.candidate == 1
 
 
