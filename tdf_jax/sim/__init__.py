@@ -24,7 +24,7 @@ Modules:
     grasps: grasps of generated objects that a demonstration shows
     grasping: whether a grasp holds an object that is lifted and turned
     centring: a grasp in the middle of what is between the fingers
-    swing: how a held object swings, and turning a hand so that it does not
+    swing: turning a hand so that what it holds does not swing
     tasks: what is picked, where it goes, and where objects start
     replay: baselines: the demonstrated path by other means, and the paper's energy
     episode: one task from the start to the settled end

@@ -110,11 +110,6 @@ def run_campaign(
             for one in pending:
                 yield one.result()
                 bar.update()
-        except concurrent.futures.process.BrokenProcessPool:
-            raise InputError(
-                "tdf simulate: a process ended by itself, perhaps for lack of memory; what is finished is kept. Run "
-                "the command again, with --processes 1 if it ends again"
-            ) from None
         finally:
             for one in pending:
                 one.cancel()
@@ -128,7 +123,11 @@ def _cores() -> int:
 
 @contextlib.contextmanager
 def process_pool(count: int):
-    """Processes in which a product of matrices uses one core: the order of its sums is the same in all."""
+    """Processes in which a product of matrices uses one core: the order of its sums is the same in all.
+
+    Raises:
+        InputError: one of them ended by itself.
+    """
     flag, name = "--xla_cpu_multi_thread_eigen=false", "XLA_FLAGS"
     before = os.environ.get(name)
     os.environ[name] = f"{before} {flag}" if before else flag
@@ -136,6 +135,11 @@ def process_pool(count: int):
         context = multiprocessing.get_context("spawn")
         with concurrent.futures.ProcessPoolExecutor(count, context, initializer=workers.begin) as pool:
             yield pool
+    except concurrent.futures.process.BrokenProcessPool:
+        raise InputError(
+            "tdf simulate: a process ended by itself, perhaps for lack of memory; what is finished is kept. Run the "
+            "command again, with --processes 1 if it ends again"
+        ) from None
     finally:
         if before is None:
             del os.environ[name]

@@ -1,4 +1,4 @@
-"""How an object swings in a hand that holds it far from its centre of mass, and turning a hand so that it does not."""
+"""Turning a hand so that what it holds, far from its centre of mass, does not swing."""
 
 import numpy as np
 from jaxtyping import Float
@@ -30,22 +30,3 @@ def level_rotations(
     shares = np.asarray(shares, float)[:, None]
     between = Rotation.from_rotvec(shares * turn.as_rotvec()) * Rotation.from_rotvec(shares * tilt.as_rotvec())
     return between.as_matrix() @ start
-
-
-def swing_arm(poses: Float[np.ndarray, "poses 4 4"], centre: Float[np.ndarray, "3"]) -> float:
-    """The largest arm with which weight turns a held object about the closing axis of the hand.
-
-    Two pads hold least against this turn. Of equally good grasps, that with the smallest arm holds best. The middle of
-    a cloud does for the centre of mass.
-
-    Args:
-        poses: poses of the gripper's frame from the pick to the release, (poses, 4, 4), metres, world frame with z up.
-        centre: centre of mass of the object at the pick, (3,), metres, world frame.
-
-    Returns:
-        The arm, metres.
-    """
-    rotations = poses[:, :3, :3]
-    held = rotations[0].T @ (np.asarray(centre, float) - poses[0, :3, 3])
-    up = rotations[:, 2, :]  # in the gripper's frame
-    return float(np.abs(held[2] * up[:, 0] - held[0] * up[:, 2]).max())

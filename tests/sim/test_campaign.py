@@ -1,6 +1,7 @@
 """Campaigns: the same outcomes in any number of processes, kept between runs, and what cannot be measured."""
 
 import dataclasses
+import os
 import types
 
 import numpy as np
@@ -341,3 +342,10 @@ def test_what_cannot_be_measured_is_refused(change, message):
     with pytest.raises(InputError, match=f"tdf simulate: {message}"):
         check_condition(SHELF._replace(**change))
     check_condition(SHELF)
+
+
+def test_a_process_that_is_killed_ends_in_a_line():
+    """Whether it runs episodes, films one or draws failures."""
+    with pytest.raises(InputError, match="a process ended by itself, .* Run the command again"):
+        with campaign.process_pool(1) as pool:
+            pool.submit(os._exit, 3).result()
