@@ -6,6 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
+from tdf_jax.geometry.pinhole import camera_matrix, looking_at
+
 WIDTH, HEIGHT, FOVY = 640, 480, 45.0  # pixels and degrees
 DISTANCES, ELEVATIONS = (0.4, 1.0), (20.0, 70.0)  # metres from the object, and degrees above the horizontal
 # Metres: standard deviation of a depth at a distance. It grows with the distance squared, as that of stereo cameras.
@@ -31,35 +33,6 @@ class DepthImage:
     labels: Int[np.ndarray, "height width"]
     K: Float[np.ndarray, "3 3"]
     T_world_camera: Float[np.ndarray, "4 4"]
-
-
-def camera_matrix(width: int = WIDTH, height: int = HEIGHT) -> Float[np.ndarray, "3 3"]:
-    """Matrix K of a camera with a vertical field of view of `FOVY`, pixels.
-
-    Args:
-        width: width of the image, pixels.
-        height: height of the image, pixels.
-    """
-    focal_length = height / 2 / np.tan(np.radians(FOVY) / 2)
-    return np.array([[focal_length, 0, (width - 1) / 2], [0, focal_length, (height - 1) / 2], [0, 0, 1]])
-
-
-def looking_at(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-    """Pose of a camera that looks at a point from above or from the side, the world's z axis up in the image.
-
-    Args:
-        position: where the camera is, (3,), metres, world frame.
-        target: point in the middle of the image, (3,), metres, world frame; not straight below or above.
-
-    Returns:
-        T_world_camera, (4, 4), metres.
-    """
-    forward = (target - position) / np.linalg.norm(target - position)
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = np.column_stack([right, np.cross(forward, right), forward]), position
-    return T
 
 
 def camera_poses(
@@ -108,7 +81,7 @@ def depth_image(
         width: width of the image, pixels.
         height: height of the image, pixels.
     """
-    K = camera_matrix(width, height)
+    K = camera_matrix(FOVY, width, height)
     R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
     middle = triangles[0].reshape(-1, 3).mean(axis=0)
     corners = np.array([[x, y, 0.0] for x in (-1, 1) for y in (-1, 1)]) * TABLE_REACH + [*middle[:2], 0.0]

@@ -6,6 +6,7 @@ Modules:
     distance_fields: signed distances of boxes, meshes and clouds, as obstacles
     grid: regular grids along a line, in a plane or in a volume
     paths: demonstrated paths: line, semicircle, wave, lift, tilt, hang
+    pinhole: the matrix of a camera, and the pose of one that looks at a point
     query: query points of the gripper or the placing region
     registration: a region of a cloud brought onto another cloud by closest points
     sampling: points of a surface; farthest-point sampling

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
+from tdf_jax.geometry.pinhole import camera_matrix, looking_at
 from tdf_jax.sim.physics import extra
 
 # A frame of 640 x 480 of a cell with 131 geoms costs 0.25 s by rays on one core, a tenth for the window of a mug, and
@@ -54,13 +55,12 @@ class Camera:
     @property
     def focal_length(self) -> float:
         """Focal length, pixels, in both directions."""
-        return self.height / 2 / float(np.tan(np.radians(self.fovy) / 2))
+        return float(self.intrinsics[0, 0])
 
     @property
     def intrinsics(self) -> Float[np.ndarray, "3 3"]:
-        """Matrix K as in OpenCV: whole pixel coordinates (column, row) are the centres of pixels."""
-        f = self.focal_length
-        return np.array([[f, 0, (self.width - 1) / 2], [0, f, (self.height - 1) / 2], [0, 0, 1]])
+        """Matrix K, pixels; see `tdf_jax.geometry.pinhole.camera_matrix`."""
+        return camera_matrix(self.fovy, self.width, self.height)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -105,17 +105,9 @@ def look_at(
         InputError: the two are the same point, or a value is out of range.
     """
     start, end = (np.asarray(checks.vector("look_at()", *one)) for one in (("position", position), ("target", target)))
-    length = float(np.linalg.norm(end - start))
-    if not length > 1e-6:
+    if not np.linalg.norm(end - start) > 1e-6:
         raise InputError(f"look_at(): position and target are both {end.tolist()}; expected two different points")
-    forward = (end - start) / length
-    right = np.cross(forward, (0, 0, 1))
-    if np.linalg.norm(right) < 1e-6:  # straight down or up: the image's right is the world's -y
-        right = np.array([0, -1.0, 0])
-    right /= np.linalg.norm(right)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = np.column_stack([right, np.cross(forward, right), forward]), start
-    return Camera(T, fovy, width, height)
+    return Camera(looking_at(start, end), fovy, width, height)
 
 
 def camera_ring(

@@ -7,16 +7,16 @@ import trimesh
 from tdf_jax.evaluation.depth_images import (
     DISTANCES,
     ELEVATIONS,
+    FOVY,
     NOISE,
     NOISE_DISTANCE,
     NOTHING,
     TABLE,
-    camera_matrix,
     camera_poses,
     cast,
     depth_image,
-    looking_at,
 )
+from tdf_jax.geometry.pinhole import camera_matrix, looking_at
 
 BOX = trimesh.creation.box((0.06, 0.08, 0.1)).apply_translation((0, 0, 0.05))
 SMALL = {"width": 320, "height": 240}
@@ -43,7 +43,7 @@ def brute_force(triangles, K, shape):
 def test_rays_meet_the_nearest_triangle(monkeypatch):
     rng = np.random.default_rng(0)
     triangles = rng.uniform((-0.5, -0.4, 0.8), (0.5, 0.4, 1.5), (30, 3, 3))
-    K, shape = camera_matrix(40, 30), (30, 40)
+    K, shape = camera_matrix(FOVY, 40, 30), (30, 40)
     expected = brute_force(triangles, K, shape)
     assert 0.2 < np.isfinite(expected).mean() < 1
     np.testing.assert_allclose(cast(triangles, K, shape), expected, rtol=1e-9)
