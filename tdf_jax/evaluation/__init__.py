@@ -10,6 +10,7 @@ Modules:
     cases: pairs of objects with a true pose
     clearance_study: colliding paths in random scenes, pushed clear
     conditions: complete, partial, sparse and noisy clouds
+    confidence_study: reliability of the confidence of picks, and the fit of its curve
     depth_images: depth images of meshes on a table
     demonstration_count: picks from several demonstrations
     metrics: errors of poses and paths
