@@ -4,6 +4,7 @@ Modules:
     boundary: settings of JAX, traced values and foreign arrays of callers
     cache: results kept by digest
     checks: validators of arguments
+    compiled: compiled programs on disk
     deprecation: names of the release before
     devices: work shared among devices
     errors: the exception of a user's mistake, and warnings

@@ -13,6 +13,7 @@ import tyro
 from tqdm import tqdm
 
 from tdf_jax._internal.boundary import own_settings
+from tdf_jax._internal.compiled import kept_compiled
 from tdf_jax._internal.devices import platform_problem
 from tdf_jax._internal.errors import InputError, TdfWarning
 from tdf_jax.cli.pictures import PictureError
@@ -20,6 +21,11 @@ from tdf_jax.cli.streams import guarded, write_failure
 from tdf_jax.landscape.storage import DEPRECATED_REDUCTIONS
 from tdf_jax.paper.setting import DEPRECATED_FIELD_ENERGIES
 
+NO_CACHE = "--no-cache"  # of every command
+DESCRIPTION = (
+    "Imitate a demonstrated pick-and-place trajectory on new objects. Compiled programs are kept in the user's cache, "
+    f"so that the next command starts sooner; {NO_CACHE} neither reads nor writes them."
+)
 MEMORY = "error: out of memory; lower the number of starts, poses, query points or points, or raise the pitch"
 # each is a function in the module of its name
 COMMANDS = (
@@ -82,12 +88,14 @@ def _code(arguments: Sequence[str]) -> int | str | None:
     """Run one command, and give its exit code; None if it ends without one."""
     stopped: list[signal.Signals] = []
     try:
-        with _warnings(), _signals(stopped), own_settings():
+        keep = contextlib.nullcontext() if NO_CACHE in arguments else kept_compiled()
+        arguments = [word for word in arguments if word != NO_CACHE]
+        with _warnings(), _signals(stopped), own_settings(), keep:
             commands = {name: getattr(importlib.import_module(f"tdf_jax.cli.{name}"), name) for name in COMMANDS}
             tyro.extras.subcommand_cli_from_dict(
                 commands,
                 prog="tdf",
-                description="Imitate a demonstrated pick-and-place trajectory on new objects.",
+                description=DESCRIPTION,
                 args=_current(arguments),
                 config=STYLE,
             )

@@ -1,7 +1,6 @@
 """Convex parts of users' meshes, by CoACD, and the bodies that they make; generated objects have exact parts."""
 
 import importlib.metadata
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +9,7 @@ from jaxtyping import Float
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.cache import digest, kept
+from tdf_jax._internal.compiled import user_cache
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.winding import inside, libigl
 from tdf_jax.sim.bodies import Body
@@ -136,8 +136,7 @@ def _is_solid(mesh) -> bool:
 
 def _folder(function: str, given: str | Path | None) -> Path:
     if given is None:
-        cache = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-        folder = Path(cache) / "tdf_jax" / "decompositions"
+        folder = user_cache("decompositions")
     else:
         folder = checks.path(function, given, "folder")
     try:
