@@ -7,6 +7,7 @@ M = A_t D inverse(A_o).
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from tdf_jax._internal import checks
+from tdf_jax._internal import checks, devices
 from tdf_jax._internal.boundary import host
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import EnergyWeights
@@ -544,7 +545,7 @@ def _moved(points, motion):
     return points @ R.T + np.asarray(motion, float)[4:]
 
 
-@jax.jit
+@functools.partial(jax.jit, compiler_options=devices.FAST_COMPILATION)
 def _carried(path: Trajectory, released_contact, picks, motions, target_contacts, arrival, deeper):
     def one(pick, motion, target_contact, deeper):
         target_motion = se3.compose(target_contact, se3.inverse(released_contact))

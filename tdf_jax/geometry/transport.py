@@ -1,13 +1,14 @@
 """A demonstrated path warped to new ends."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tdf_jax._internal import checks
+from tdf_jax._internal import checks, devices
 from tdf_jax._internal.boundary import public
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
@@ -208,7 +209,7 @@ def arrival_depth(
     return max(0.0, float((target_points[~beside] @ outward).max() - (points @ outward).min()))
 
 
-@jax.jit
+@functools.partial(jax.jit, compiler_options=devices.FAST_COMPILATION)
 def carry_to_picks(
     demonstrated: Trajectory, picks: Float[Array, "starts 7"], goal: Float[Array, "7"] | None
 ) -> Float[Array, "starts poses 7"]:
