@@ -23,7 +23,6 @@ SPREAD = 0.006  # metres along the approach that the points must span for a slop
 WALL_BESIDE, THICKEST = 0.022, 0.018
 OUTLIERS, NEAR = 2.5, 0.0004
 LEAST_OF_WALL, LEAST_OF_SIDE = 10, 6  # points for a fit, and on both sides for a taper
-MOST_OF_WALL = 0.025  # metres along the closing direction between the pads; more is no wall
 GRID = 0.001  # metres between points of the fitted surfaces
 FLUSH = 0.005  # radians; a smaller turn ends the search
 # A neck is round about an axis to this, metres, in the median; its radius is linear between levels so far apart.
@@ -89,19 +88,18 @@ def centred(
 def _on_wall(T, points, opening: float, fingers: Fingers) -> tuple[np.ndarray, float]:
     """A grasp in the middle of the wall between the fingers and flush with it, and the opening."""
     tip = fingers.tip(max(opening - 2 * CLEARANCE, 0.0))  # as far as the fingers reach once they have closed
-    x, y, z = _between(T, points, HALF_PAD, fingers.widest, tip)
-    if len(y) and np.ptp(y) > MOST_OF_WALL:  # a neck that is not round
-        T = T.copy()
-        T[:3, 3] += np.clip((y.min() + y.max()) / 2, -LONGEST, LONGEST) * T[:3, 1]
-        return T, min(float(np.ptp(y)) + 2 * necks.CLEARANCE, fingers.widest)
-    T = _along_wall(T, points, opening, tip)
-    x, y, z = _between(T, points, WALL_BESIDE, opening, tip)
-    if len(y) < LEAST_OF_WALL:
-        return T, opening
-    surfaces, thickness = _wall(x, y, z, tip + BEYOND)
-    if thickness > THICKEST:
-        return T, opening
-    return T, min(2 * float(np.abs(surfaces[:, 1]).max()) + 2 * CLEARANCE, fingers.widest)
+    flush = _along_wall(T, points, opening, tip)
+    x, y, z = _between(flush, points, WALL_BESIDE, opening, tip)
+    if len(y) >= LEAST_OF_WALL:
+        surfaces, thickness = _wall(x, y, z, tip + BEYOND)
+        if thickness <= THICKEST:
+            return flush, min(2 * float(np.abs(surfaces[:, 1]).max()) + 2 * CLEARANCE, fingers.widest)
+    _, y, _ = _between(T, points, HALF_PAD, fingers.widest, tip)
+    if not len(y) or np.ptp(y) <= THICKEST:
+        return flush, opening
+    T = T.copy()  # a neck that is not round
+    T[:3, 3] += np.clip((y.min() + y.max()) / 2, -LONGEST, LONGEST) * T[:3, 1]
+    return T, min(float(np.ptp(y)) + 2 * necks.CLEARANCE, fingers.widest)
 
 
 def _along_wall(T, points, opening: float, tip: float):
