@@ -13,6 +13,7 @@ Modules:
     confidence_study: reliability of the confidence of picks, and the fit of its curve
     depth_images: depth images of meshes on a table
     demonstration_count: picks from several demonstrations
+    foreign_study: picks on clouds with foreign points, with and without their removal
     metrics: errors of poses and paths
     path_methods: methods that imitate a whole trajectory
     path_report: page and record of `tdf benchmark`
