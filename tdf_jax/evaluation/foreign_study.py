@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.spatial import Delaunay, KDTree
 
-from tdf_jax._internal.errors import ForeignPointsWarning
+from tdf_jax._internal.errors import ForeignPointsWarning, SizeWarning
 from tdf_jax._internal.files import replace_file
 from tdf_jax.energy.reference import Reference
 from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, SEED_SPACE, Case, generated_case, size_of
@@ -118,7 +118,8 @@ def measure(model: Model, case: Case, row: str, pair: int, query: Float[Array, "
     picks = []
     for clean in (True,) if row == NONE else (False, True):
         with warnings.catch_warnings():  # the record has the numbers
-            warnings.simplefilter("ignore", ForeignPointsWarning)
+            for kind in (ForeignPointsWarning, SizeWarning):
+                warnings.simplefilter("ignore", kind)
             field, kept = encode(model, case.points_b, clean=clean, return_kept=True)
         distance, angle = picked(field, reference, case, pair)
         lost = int((~kept[: case.own]).sum()), int((~kept & handle).sum())
