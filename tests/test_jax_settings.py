@@ -344,6 +344,12 @@ def test_no_result_needs_a_compilation(world, name):
 
 # --- in functions that jit, vmap and grad trace ---
 
+
+def followed(result):
+    """Arrays of a solver's result that are known everywhere."""
+    return result.trajectories, result.energies, result.candidate_history, result.initial_trajectories, result.loss
+
+
 # Functions of one array that can be traced, and that array.
 PURE = {
     "DescriptorField": (lambda w, x: (w.field.descriptors(x), w.field.occupancy(x)), "query"),
@@ -385,10 +391,13 @@ PURE = {
     ),
 }
 # As well, but without a reverse-mode derivative.
-NO_GRADIENT = {"pose_covariance": (lambda w, x: tdf.pose_covariance(w.field, w.reference, x).covariance, "pose")}
+NO_GRADIENT = {
+    "carry": (lambda w, x: followed(tdf.carry(w.field, w.reference, KEY, goal=x, config=CARRY)), "goal"),
+    "pose_covariance": (lambda w, x: tdf.pose_covariance(w.field, w.reference, x).covariance, "pose"),
+    "solve": (lambda w, x: followed(tdf.solve(w.field, w.reference, KEY, goal=x, config=SOLVE)), "goal"),
+}
 # Functions of one array that compute with its numbers.
 REFUSED = {
-    "carry": (lambda w, x: tdf.carry(w.field, w.reference, KEY, goal=x, config=CARRY), "goal"),
     "clearance": (lambda w, x: tdf.clearance(tdf.Trajectory(x), w.query, [w.box]), "poses"),
     "cloud_obstacle": (lambda w, x: tdf.cloud_obstacle(x), "shown"),
     "cluster_poses": (lambda w, x: tdf.cluster_poses(x, w.steps), "poses"),
@@ -422,7 +431,6 @@ REFUSED = {
     "save_trajectory": (lambda w, x: tdf.save_trajectory(w.folder / "x.npz", tdf.Trajectory(x)), "poses"),
     "semicircle": (lambda w, x: tdf.semicircle(4, start=x), "vector"),
     "separate_objects": (lambda w, x: tdf.separate_objects(x), "shown"),
-    "solve": (lambda w, x: tdf.solve(w.field, w.reference, KEY, goal=x), "goal"),
     "surface_logit": (lambda w, x: tdf.surface_logit(w.field, x), "shown"),
     "thin": (lambda w, x: tdf.thin(x, 5), "shown"),
     "tilt_and_pour": (lambda w, x: tdf.tilt_and_pour(4, start=x), "vector"),
@@ -489,9 +497,7 @@ def test_what_needs_known_numbers_is_refused_by_name(world, name, transform):
         transform(lambda x: function(world, x))(jnp.stack([x, x]) if transform is jax.vmap else x)
 
 
-@pytest.mark.parametrize(
-    "name", ["carry", "clearance", "energy_landscape", "imitate", "optimize", "push_clear", "solve"]
-)
+@pytest.mark.parametrize("name", ["clearance", "energy_landscape", "imitate", "optimize", "push_clear"])
 def test_known_numbers_inside_jit_are_refused_by_name(world, name):
     assert world.box and world.near and world.grid  # made before anything is traced
     with pytest.raises(tdf.InputError, match=rf"{name}\(\): it is called inside a function that jax.jit traces"):

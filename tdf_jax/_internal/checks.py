@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tdf_jax._internal.boundary import is_foreign, plain_array
+from tdf_jax._internal.devices import tracing
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.units import MILLIMETRES
 
@@ -35,6 +36,11 @@ MINIMUM_POINTS = 21  # the encoder's 20 nearest neighbours, the point itself inc
 def traced(*values) -> bool:
     """Whether one of the values is traced, so that its numbers are not known yet."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+
+
+def in_trace(*values) -> bool:
+    """Whether one of the values is traced, or a function that `jax.jit` traces is running."""
+    return traced(*values) or tracing()
 
 
 def count(function: str, name: str, value, least: int = 1, most: float = np.inf) -> int:

@@ -3,9 +3,14 @@
 Each device takes a part of the starts or of a grid, and the processes exchange nothing but results.
 """
 
+import functools
+from collections.abc import Callable
+
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_batching import sequential_vmap
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
@@ -26,6 +31,40 @@ def one_at_a_time() -> bool:
     They do on a CPU, whose cache then holds one piece. An accelerator needs all of them together.
     """
     return jax.default_backend() == "cpu"
+
+
+def tracing() -> bool:
+    """Whether a function that `jax.jit` traces is running."""
+    return isinstance(jnp.zeros(()), jax.core.Tracer)
+
+
+def quickly_compiled(function: Callable, static_argnames: str | tuple[str, ...] = ()) -> Callable:
+    """Decorator as `jax.jit`, of a program that runs once a call, see `FAST_COMPILATION`."""
+    alone = jax.jit(function, static_argnames=static_argnames, compiler_options=FAST_COMPILATION)
+    # A part of another program has no options of its own.
+    part = jax.jit(function, static_argnames=static_argnames)
+
+    @functools.wraps(function)
+    def compiled(*arguments, **keywords):
+        return (part if tracing() else alone)(*arguments, **keywords)
+
+    return compiled
+
+
+def mapped(function: Callable) -> Callable:
+    """The function, which `jax.vmap` runs for one element after the other where that is faster, see `one_at_a_time`.
+
+    It takes arrays by position, and has no reverse-mode derivative.
+    """
+    if not one_at_a_time():
+        return function
+
+    def one_by_one(*arguments):
+        # Of leaves, because `sequential_vmap` puts its own values into the places of a pytree, whose class checks them.
+        leaves, tree = jax.tree.flatten(arguments)
+        return sequential_vmap(lambda *leaves: function(*jax.tree.unflatten(tree, leaves)))(*leaves)
+
+    return one_by_one
 
 
 def points_at_a_time(cpu_points: int) -> int:
@@ -102,7 +141,7 @@ def gathered(array: jax.Array) -> np.ndarray:
     return np.asarray(multihost_utils.process_allgather(array, tiled=True))
 
 
-def padded(array: np.ndarray, device_mesh: Mesh) -> np.ndarray:
+def padded(array: np.ndarray | jax.Array, device_mesh: Mesh) -> np.ndarray:
     """The array, repeated from its beginning up to a multiple of the number of devices."""
     array = np.asarray(array)
     return np.resize(array, (-(-len(array) // device_mesh.size) * device_mesh.size, *array.shape[1:]))

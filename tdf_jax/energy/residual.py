@@ -29,6 +29,12 @@ def pick_residual(energy: float, descriptors: Float[Array, "queries channels"]) 
     return float(energy) / spread if spread > 0 else float("nan")
 
 
+def traced_pick_residual(energy: Float[Array, ""], descriptors: Float[Array, "queries channels"]) -> Float[Array, ""]:
+    """Compute `pick_residual` of traced numbers; it is infinite, not NaN, if there is one query point."""
+    spread = jnp.mean(jnp.abs(descriptors - jnp.mean(descriptors, axis=0)))
+    return jnp.where(spread > 0, energy / jnp.where(spread > 0, spread, 1.0), jnp.inf)
+
+
 def surface_logits(field: DescriptorField, points: Float[Array | np.ndarray, "points 3"]) -> Float[np.ndarray, " used"]:
     """Logits of the occupancy at an object's own points, each clipped to [-3, 3].
 

@@ -3,8 +3,10 @@
 import warnings
 from typing import TYPE_CHECKING
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import public
@@ -95,7 +97,9 @@ def drop_invalid(points: Float[np.ndarray, "*grid 3"]) -> Float[np.ndarray, "poi
     return kept
 
 
-def subsamples(points: Float[np.ndarray, "points 3"], count: int, times: int) -> Float[np.ndarray, "times count 3"]:
+def subsamples(
+    points: Float[Array | np.ndarray, "points 3"], count: int, times: int
+) -> Float[Array | np.ndarray, "times count 3"]:
     """Make several farthest-point subsamples of one cloud: the first of all points, the others of random parts.
 
     The random parts depend only on the number of points. A cloud of less than `2 * count / PART` points has one
@@ -103,18 +107,28 @@ def subsamples(points: Float[np.ndarray, "points 3"], count: int, times: int) ->
     subsamples is worse than one subsample of all points.
 
     Args:
-        points: point cloud, (points, 3), metres, more than `count`.
+        points: point cloud, (points, 3), metres, more than `count`; traced, the choice of points has no gradient.
         count: number of points in a subsample, at least 1.
         times: number of subsamples, at least 1; a sparse cloud has one, see above.
 
     Returns:
         The subsamples, (times, count, 3).
     """
-    subsets = [thin(points, count)]
-    rng = np.random.default_rng(len(points))
-    for _ in range(times - 1 if PART * len(points) >= 2 * count else 0):
-        subsets.append(thin(points[rng.permutation(len(points))[: int(PART * len(points))]], count))
-    return np.stack(subsets)
+    rng, size = np.random.default_rng(len(points)), int(PART * len(points))
+    number = times - 1 if PART * len(points) >= 2 * count else 0
+    parts = [rng.permutation(len(points))[:size] for _ in range(number)]
+    if not checks.traced(points):
+        cloud = np.asarray(points)
+        return np.stack([thin(cloud, count), *(thin(cloud[part], count) for part in parts)])
+
+    def chosen(part):
+        return part[traced_farthest_point_indices(part, count)]
+
+    cloud = jnp.asarray(points)
+    first = chosen(cloud)[None]
+    if not parts:
+        return first
+    return jnp.concatenate([first, jax.lax.map(lambda part: chosen(cloud[part]), jnp.asarray(np.stack(parts)))])
 
 
 def farthest_point_indices(points: Float[np.ndarray, "points 3"], count: int) -> Int[np.ndarray, " subset"]:
@@ -154,6 +168,36 @@ def farthest_point_indices(points: Float[np.ndarray, "points 3"], count: int) ->
         distance[last] = -1  # chosen points are not chosen again, even if other points coincide with them
         indices[i] = np.argmax(distance)
     return indices
+
+
+def traced_farthest_point_indices(points: Float[Array, "points 3"], count: int) -> Int[Array, " subset"]:
+    """Choose points of a traced cloud as `farthest_point_indices` does, which needs no compilation.
+
+    Both choose the same points unless rounding decides which is the farthest.
+
+    Args:
+        points: point cloud, (points, 3), metres, more than `count`; its numbers are not checked.
+        count: number of points to choose, at least 1.
+
+    Returns:
+        Indices in the order of choice, (count,); they have no gradient.
+    """
+    points = jax.lax.stop_gradient(points)
+    # Columns are faster than rows here too.
+    columns = (points - jnp.mean(points, axis=0)).T
+
+    def squares(columns):
+        x, y, z = columns * columns
+        return x + y + z
+
+    def choose(i, state):
+        indices, distance = state
+        last = indices[i - 1]
+        distance = jnp.minimum(distance, squares(columns - columns[:, last, None])).at[last].set(-1.0)
+        return indices.at[i].set(jnp.argmax(distance)), distance
+
+    first = jnp.zeros(count, int).at[0].set(jnp.argmax(squares(columns)))
+    return jax.lax.fori_loop(1, count, choose, (first, jnp.full(len(points), jnp.inf, points.dtype)))[0]
 
 
 @public

@@ -1,7 +1,6 @@
 """A demonstrated path warped to new ends."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -209,7 +208,7 @@ def arrival_depth(
     return max(0.0, float((target_points[~beside] @ outward).max() - (points @ outward).min()))
 
 
-@functools.partial(jax.jit, compiler_options=devices.FAST_COMPILATION)
+@devices.quickly_compiled
 def carry_to_picks(
     demonstrated: Trajectory, picks: Float[Array, "starts 7"], goal: Float[Array, "7"] | None
 ) -> Float[Array, "starts poses 7"]:

@@ -81,7 +81,7 @@ def encode(
         model: network.
         points: point cloud of the object, (points, 3), metres, world frame; at least 21 points.
         num_subsamples: farthest-point subsamples to average, see `sampling.subsamples`; 0 uses all points.
-        clean: remove foreign points. Points that are traced by `jax.jit` are taken as they are.
+        clean: remove foreign points. Points that are traced by `jax.jit` or `jax.vmap` are taken as they are.
         return_kept: also return which points were kept.
 
     Returns:
@@ -91,8 +91,7 @@ def encode(
 
     Raises:
         InputError: the points are fewer than 21 or than the network's neighbours, not (points, 3), not finite, all
-            equal, no measurements, or farther from the origin than float32 resolves; `num_subsamples` is negative; or
-            the points are denser than the network's and traced by `jax.jit`.
+            equal, no measurements, or farther from the origin than float32 resolves; or `num_subsamples` is negative.
 
     Warns:
         ForeignPointsWarning: points near the object are removed; or more than 30 % of the points look foreign, and
@@ -111,13 +110,23 @@ def encode(
             f"{model.config.neighbours} neighbours"
         )
     if checks.traced(cloud):
+        shift = jnp.zeros_like(cloud[0])
         if num_subsamples and density is not None and len(cloud) > density:
-            raise InputError(
-                f"encode(): {len(cloud)} points cannot be subsampled to {density} under jax.jit; expected that many. "
-                "Subsample the cloud outside with tdf.thin, or pass num_subsamples=0"
-            )
-        field = _average(model.params, model.config, cloud[None], _anchor(cloud), jnp.zeros_like(cloud[0]))
+            shift = jax.lax.stop_gradient(jnp.mean(cloud, axis=0))
+            clouds = sampling.subsamples(cloud - shift, density, num_subsamples)
+        else:
+            clouds = cloud[None]
+        field = _average(model.params, model.config, clouds, _anchor(cloud) - shift, shift)
         return (field, np.ones(len(cloud), bool)) if return_kept else field
+    if checks.traced(model.params):
+        return _encoded(model, cloud, num_subsamples, clean, return_kept)
+    # A known cloud is encoded while a function that uses it is traced: whether its points are foreign is computed.
+    with jax.ensure_compile_time_eval():
+        return _encoded(model, cloud, num_subsamples, clean, return_kept)
+
+
+def _encoded(model, cloud, num_subsamples, clean, return_kept):
+    """`encode` of known points."""
     cloud = np.asarray(cloud)
     checks.near("encode()", "points", cloud)
     kept = _gathered(cloud, model.config.neighbours) if clean else np.ones(len(cloud), bool)

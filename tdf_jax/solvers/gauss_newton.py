@@ -43,7 +43,6 @@ class Problem(NamedTuple):
     centre: Float[Array, "3"]
 
 
-@functools.partial(jax.jit, compiler_options=devices.FAST_COMPILATION)
 def in_blocks(reference: Reference, order: Int[Array, "blocks size"], counts: Bool[Array, "blocks size"]) -> Problem:
     """Arrange the query points of a reference in blocks.
 

@@ -30,7 +30,7 @@ def prepare(
     starts: Float[Array | np.ndarray, "starts poses 7"] | None,
     device_mesh: jax.sharding.Mesh | None,
     num_starts: int,
-) -> tuple[Float[np.ndarray, "starts poses 7"], EnergyWeights]:
+) -> tuple[Float[Array | np.ndarray, "starts poses 7"], EnergyWeights]:
     """Check or draw the starts, end them at the goal if there is one, and give the weights the type of the starts.
 
     Args:
@@ -47,7 +47,7 @@ def prepare(
         num_starts: number of random starts, if none are given.
 
     Returns:
-        Initial trajectories, T_world_query, and the weights.
+        Initial trajectories, T_world_query, in numpy unless they are traced, and the weights.
 
     Raises:
         InputError: as for `optimize`.
@@ -71,7 +71,7 @@ def prepare(
         starts = random_starts(key, field, reference, num_starts, config.start, config.start_radius)
     if goal is not None:
         checks.pose(function, "goal", goal)
-    given = np.asarray(starts)
+    given = starts if checks.traced(starts) else np.asarray(starts)
     if given.ndim != 3 or given.shape[1:] != (reference.trajectory.num_poses, 7):
         raise InputError(
             f"{function}: starts have shape {given.shape}; expected (starts, {reference.trajectory.num_poses}, 7), "
@@ -81,11 +81,20 @@ def prepare(
     dtype = jnp.result_type(given, reference.query, reference.descriptors, field.latent)
     _check_weights(function, energy)
     energy = jax.tree.map(lambda weight: jnp.asarray(weight, dtype), energy)
+    if checks.traced(given, goal):
+        if not checks.traced(given) and given.shape[1] > 1:  # the last poses give way to the goal
+            _check_poses(given[:, :-1])
+        initial = jnp.asarray(given, dtype)
+        return initial if goal is None else initial.at[:, -1].set(jnp.asarray(goal, dtype)), energy
     initial = np.array(given, dtype)
     if goal is not None:
         initial[:, -1] = goal
-    check_trajectory(Trajectory(jnp.asarray(initial.reshape(-1, 7))), "starts", anywhere=True)
+    _check_poses(initial)
     return initial, energy
+
+
+def _check_poses(starts):
+    check_trajectory(Trajectory(starts.reshape(-1, 7)), "starts", anywhere=True)
 
 
 def default_goal(field: DescriptorField, reference: Reference) -> Float[Array, "7"]:
@@ -119,7 +128,7 @@ def random_starts(
     return _random_starts(key, field.origin, reference, radius, num_starts=num_starts, start=start)
 
 
-@functools.partial(jax.jit, static_argnames=("num_starts", "start"), compiler_options=devices.FAST_COMPILATION)
+@functools.partial(devices.quickly_compiled, static_argnames=("num_starts", "start"))
 def _random_starts(key, origin, reference, radius, *, num_starts, start):
     def draw(m):
         return _start(jax.random.fold_in(key, m), origin, reference, start, radius)

@@ -12,20 +12,24 @@ minima, so it gets more starts than the others. All stages but the last evaluate
    centroids;
 5. refine: the best distinct candidates of each waypoint;
 6. polish: the same, with all query points.
+
+From stage to stage the host sorts the candidates, in numpy. A traced call is one program, in which `jax.lax.scan` runs
+the stages.
 """
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from tdf_jax._internal import checks, devices
-from tdf_jax._internal.boundary import host
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.deprecation import renamed_fields, renamed_keywords
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import EnergyWeights
@@ -41,7 +45,9 @@ from tdf_jax.solvers.result import Result, with_ends
 CHUNK_POINTS = 128
 STAGES = ("coarse", "prune", "search", "propagate", "refine", "polish")
 FIRST_DAMPINGS = {"coarse": 1.0, "prune": 0.3, "search": 1.0, "propagate": 0.3, "refine": 0.1, "polish": 0.03}
-SAME_ANGLE, SAME_DISTANCE = np.radians(10), 0.01  # radians and metres within which two candidates count as one
+ORDER = np.uint32(2**32 - 1)  # folded into the key for the order of the query points; no start has this number
+# Within 10 degrees and these metres two candidates count as one.
+COSINE_SAME, SAME_DISTANCE = float(np.cos(np.radians(10))), 0.01
 
 
 @renamed_fields(
@@ -120,23 +126,121 @@ def stage_steps(config: SolveConfig) -> dict[str, int]:
     return {stage: getattr(config, f"{stage}_steps") for stage in STAGES}
 
 
+class Plan(NamedTuple):
+    """Sizes of one call, which are static.
+
+    Attributes:
+        num_poses: number of waypoints.
+        free: number of waypoints that move, the first of all.
+        num_keyframes: number of starts of the keyframe.
+        num_trajectories: number of starts of the whole trajectory.
+        num_candidates: see `SolveConfig`.
+        num_coarse_queries: number of query points in a block, of which all stages but the last evaluate one.
+        steps: maximal number of steps of each of `STAGES`.
+        chunk: number of query points that are evaluated at a time.
+        parts: number of devices that share the poses.
+    """
+
+    num_poses: int
+    free: int
+    num_keyframes: int
+    num_trajectories: int
+    num_candidates: int
+    num_coarse_queries: int
+    steps: tuple[int, ...]
+    chunk: int
+    parts: int = 1
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """Stages in their order; one waypoint alone is neither searched nor propagated."""
+        return STAGES if self.free > 1 else ("coarse", "prune", "refine", "polish")
+
+    def shape(self, stage: str) -> tuple[int, int]:
+        """Candidates and waypoints of a stage."""
+        kept = self.num_candidates
+        return {
+            "coarse": (self.num_keyframes, 1),
+            "prune": (max(kept, self.num_keyframes // 4), 1),
+            "search": (self.num_trajectories, self.free),
+            "propagate": (self.free + kept + 1, self.free),
+            "refine": (kept, self.free),
+            "polish": (kept, self.free),
+        }[stage]
+
+    @property
+    def room(self) -> int:
+        """Number of poses that every stage's arrays have room for, so that all run the same program."""
+        most = max(rows * columns for rows, columns in map(self.shape, self.stages)) + self.num_poses - self.free
+        return -(-most // self.parts) * self.parts
+
+    @property
+    def length(self) -> int:
+        """Number of entries of a history."""
+        return max(self.steps) + 1
+
+    def num_steps(self, stage: str) -> int:
+        """Maximal number of steps of a stage."""
+        return self.steps[STAGES.index(stage)]
+
+    def bounds(self, stage: str, num_blocks: int) -> np.ndarray:
+        """The argument `bounds` of `gauss_newton.descend`."""
+        moving, polish = math.prod(self.shape(stage)), stage == "polish"
+        evaluated = moving + (self.num_poses - self.free if polish else 0)
+        return np.array([moving, evaluated, num_blocks if polish else 1, self.num_steps(stage)], np.int32)
+
+
 class Candidates(NamedTuple):
-    """Poses to choose from, on the host: there are a few hundred, and sorting them there needs no compilation.
+    """Poses to choose from, in numpy unless a call is traced.
 
     Attributes:
         R: rotations of the query frame in the world, (rows, free, 3, 3).
         centroid: positions of the query points' centroid, (rows, free, 3), metres, world frame.
         energy: energy of each pose, (rows, free), infinite where it is not finite; empty before a stage.
-        history: energies at the start of the stage and after each step, (times, rows, free); empty before a stage.
     """
 
-    R: Float[np.ndarray, "rows free 3 3"]
-    centroid: Float[np.ndarray, "rows free 3"]
-    energy: Float[np.ndarray, "rows free"] = np.empty((0, 0))
-    history: Float[np.ndarray, "times rows free"] = np.empty((0, 0, 0))
+    R: Float[Array | np.ndarray, "rows free 3 3"]
+    centroid: Float[Array | np.ndarray, "rows free 3"]
+    energy: Float[Array | np.ndarray, "rows free"] = np.empty((0, 0))
 
 
-@host
+class _Begin(NamedTuple):
+    """What the stages begin with.
+
+    Attributes:
+        drawn: the starts.
+        demonstrated: the demonstration, relative to the object's origin, (free, ...).
+        origin: the new object's origin, (3,), metres, world frame.
+        keyframe: index of the keyframe.
+    """
+
+    drawn: Candidates
+    demonstrated: Candidates
+    origin: Float[Array | np.ndarray, "3"]
+    keyframe: Int[Array | np.ndarray, ""]
+
+
+class _State(NamedTuple):
+    """What passes from stage to stage.
+
+    Attributes:
+        R: rotations at the end of the last stage, (room, 3, 3).
+        centroid: centroids at its end, (room, 3), metres, world frame.
+        values: energies at its start and after each step, (room, length).
+        starts: index of the start of each candidate, (room,).
+        picked: the best distinct keyframes, one column.
+        searched: the candidates at the end of the search.
+    """
+
+    R: Float[Array | np.ndarray, "room 3 3"]
+    centroid: Float[Array | np.ndarray, "room 3"]
+    values: Float[Array | np.ndarray, "room length"]
+    starts: Int[Array | np.ndarray, " room"]
+    picked: Candidates
+    searched: Candidates
+
+
+@public
 @renamed_keywords(mesh="device_mesh")
 def solve(
     field: DescriptorField,
@@ -153,6 +257,9 @@ def solve(
 ) -> Result:
     """Minimise `trajectory_energy` by damped Gauss-Newton steps from many starts, in stages (see the module).
 
+    Any array may be traced by `jax.jit` and `jax.vmap`; its numbers are then not checked. There is no reverse-mode
+    derivative.
+
     Args:
         field: descriptor field of the new object.
         reference: the demonstration.
@@ -165,230 +272,341 @@ def solve(
             T_world_query; both the coarse and the search stage take all of them.
         progress: function that is called after each stage with the number of steps so far and the energies of the best
             candidates, on the query points of the stage and without a fixed last pose (of the keyframe alone in the
-            first two stages). It may raise to cancel.
-        device_mesh: devices that share the candidates, of this process or of several that make the same call.
+            first two stages). It may raise to cancel. None in a traced call.
+        device_mesh: devices that share the candidates, of this process or of several that make the same call. None in a
+            traced call.
 
     Returns:
         The result. Candidate k consists of the k-th best pose of each waypoint. `initial_trajectories` holds all
-        starts.
+            starts. In a traced call `history` is infinite, not NaN, where a start is not followed.
 
     Raises:
-        InputError: as for `optimize`, or a weight on eq. 6, which couples the waypoints.
+        InputError: as for `optimize`, or a weight on eq. 6, which couples the waypoints, or a traced one.
     """
     checks.key("solve()", key)
-    num_starts = max(config.num_starts, config.num_trajectory_starts)
+    traced = checks.in_trace(field, reference, key, goal, energy, starts)
+    if traced and (progress is not None or device_mesh is not None):
+        name = "progress" if progress is not None else "device_mesh"
+        raise InputError(
+            f"solve(): there is a {name}, and the call is traced by jax.jit or jax.vmap; expected None. Drop it, or "
+            "call solve() outside of the function that is traced"
+        )
+    num_starts, weights = max(config.num_starts, config.num_trajectory_starts), energy
     initial, energy = prepare(
         "solve()", field, reference, key, goal, fix_last, energy, config, starts, device_mesh, num_starts
     )
-    if energy.compensator != 0:
+    if checks.traced(weights.compensator):
         raise InputError(
-            f"solve(): energy.compensator is {float(energy.compensator):g}; expected 0, because the solver takes "
+            "solve(): energy.compensator is traced; expected 0, because waypoints are solved one by one. Make the "
+            "weights inside of the function that is traced: EnergyWeights(correlation=...)"
+        )
+    compensator = float(np.asarray(weights.compensator))
+    if compensator != 0:
+        raise InputError(
+            f"solve(): energy.compensator is {compensator:g}; expected 0, because the solver takes "
             "waypoints one by one. Use optimize(), or imitate() with config=OptimizeConfig()"
         )
     n = initial.shape[1]
     free = n - 1 if fix_last else n
-    if not (initial[:, free:] == initial[:1, free:]).all():
+    if isinstance(initial, np.ndarray) and not (initial[:, free:] == initial[:1, free:]).all():
         raise InputError(
             "solve(): the last poses of the starts differ and fix_last keeps them; expected one, or a goal"
         )
 
-    problem = _problem(key, reference, min(config.num_coarse_queries, len(reference.query)))
-    # The starts and the demonstration share one program, which saves the compilation of a second one.
-    together = _candidates(np.concatenate([initial.reshape(-1, 7), problem.target]), problem)
-    drawn = Candidates(*(part[:-n].reshape(len(initial), n, *part.shape[1:]) for part in together[:2]))
-    demonstrated = Candidates(*(part[-n:] for part in together[:2]))
-    num_keyframes = len(initial) if starts is not None else config.num_starts
-    num_trajectories = len(initial) if starts is not None else config.num_trajectory_starts
-    kept = config.num_candidates
-    room = max(num_keyframes, max(num_trajectories, free + kept + 1) * free + 1)
-    shared, parts = (field, problem, energy), 1
-    if device_mesh is not None:
-        shared, parts = devices.placed(shared, device_mesh), device_mesh.size
-    steps = stage_steps(config)
-    run = functools.partial(_run, shared=shared, config=config, room=-(-room // parts) * parts, device_mesh=device_mesh)
-
-    def stage(name, candidates, **which):
-        found, fixed = run(name, candidates, **which)
-        if progress is not None:
-            done = sum(steps[earlier] for earlier in STAGES[: STAGES.index(name) + 1])
-            progress(done, np.sort(found.energy, axis=0)[:kept].mean(axis=1))
-        return found, fixed
-
-    def curve(found, *others):
-        """Energies (steps, candidates) of the best candidates of each waypoint during a stage.
-
-        The energies of `others` are constant.
-        """
-        rows = [found.history, *(np.broadcast_to(other, (len(found.history), *other.shape)) for other in others)]
-        ordered = np.sort(np.concatenate(rows, axis=1), axis=1)
-        return ordered[:, np.minimum(np.arange(kept), ordered.shape[1] - 1)].sum(axis=2)
-
-    keyframe = int(np.linalg.norm(demonstrated.centroid[:free], axis=1).argmin())
-    alone = [keyframe]
-    found, _ = stage(
-        "coarse", Candidates(drawn.R[:num_keyframes, alone], drawn.centroid[:num_keyframes, alone]), waypoints=alone
+    plan = Plan(
+        num_poses=n,
+        free=free,
+        num_keyframes=len(initial) if starts is not None else config.num_starts,
+        num_trajectories=len(initial) if starts is not None else config.num_trajectory_starts,
+        num_candidates=config.num_candidates,
+        num_coarse_queries=min(config.num_coarse_queries, len(reference.query)),
+        steps=tuple(stage_steps(config).values()),
+        chunk=config.chunk_queries or devices.points_at_a_time(CHUNK_POINTS),
+        parts=1 if device_mesh is None else device_mesh.size,
     )
-    curves = [curve(found)]
-    followed = [(np.arange(num_keyframes), found.history)]  # start index and energies of each row, by stage
-    pruned, rows = _distinct(found, max(kept, num_keyframes // 4))
-    lineage = rows[:, 0]
-    found, _ = stage("prune", pruned, waypoints=alone)
-    curves.append(curve(found))
-    followed.append((lineage, found.history))
-    if free > 1:
-        picked, _ = _distinct(found, kept)
-        found, _ = stage(
-            "search", Candidates(drawn.R[:num_trajectories, :free], drawn.centroid[:num_trajectories, :free])
-        )
-        curves = [curve(found)]
-        followed = [(np.arange(num_trajectories), found.history)]
-        propagated, _ = stage("propagate", _propagated(found, picked, keyframe, demonstrated, field.origin))
-        curves.append(curve(propagated, found.energy))
-        found = Candidates(*(np.concatenate(pair) for pair in zip(found[:3], propagated[:3])))
-    refined, rows = _distinct(found, kept)
-    found, _ = stage("refine", refined)
-    curves.append(curve(found))
-    if free == 1:
-        lineage = lineage[rows[:, 0]]
-        followed.append((lineage, found.history))
-    polished, rows = _distinct(found, kept)
-    found, fixed = stage("polish", polished, fixed=(drawn.R[0, free:], drawn.centroid[0, free:]))
-    if free == 1:
-        followed.append((lineage[rows[:, 0]], found.history))
-
-    order = np.argsort(found.energy, axis=0)
-    ordered = Candidates(*(np.take_along_axis(part, _like(order, part), axis=0) for part in found[:2]))
-    curves.append(np.take_along_axis(found.history, order[None], axis=1).sum(axis=2))
-    losses = (np.concatenate([*(part[:-1] for part in curves[:-1]), curves[-1]]) + fixed) / n
-    losses = losses.T.astype(initial.dtype)
-    free_poses = _poses(ordered, problem)
-    ends = np.broadcast_to(initial[:1, free:], (len(free_poses), n - free, 7))
+    tolerance = np.asarray(config.tolerance, initial.dtype)
+    if traced:
+        found = _solved(key, initial, tolerance, field, reference, energy, plan=plan)
+    else:
+        problem = _problem(key, reference, size=plan.num_coarse_queries)
+        begin = _begin(np, initial, field.origin, problem, plan)
+        state, stages = _stage_by_stage(begin, tolerance, field, problem, energy, plan, progress, device_mesh)
+        found = _finish(np, state, stages, initial, problem, plan)
+    trajectories, losses, history = found
     result = Result(
-        trajectories=jnp.asarray(np.concatenate([free_poses, ends], axis=1)),
+        trajectories=jnp.asarray(trajectories),
         energies=jnp.asarray(losses[:, -1]),
         candidate_history=jnp.asarray(losses[:, :-1]),
         initial_trajectories=jnp.asarray(initial),
         # It stays in numpy: under `jax_debug_nans` an array of jax must not hold NaN.
-        history=_history(followed, len(initial), losses.shape[1] - 1, fixed, n).astype(initial.dtype),
+        history=history,
     )
     return with_ends(result, reference)
 
 
-def _history(followed, num_starts, length, fixed, n):
-    """Energies (starts, length) of every start before each step; NaN where no stage follows it."""
-    history = np.full((num_starts, length), np.nan)
-    begin = 0
-    for starts, energies in followed:
-        count = len(energies) - 1
-        history[starts, begin : begin + count] = (energies[:-1].sum(axis=2).T + fixed) / n
-        begin += count
-    return history
+@functools.partial(jax.jit, static_argnames="plan")
+def _solved(key, initial, tolerance, field, reference, energy, *, plan):
+    """Results of a traced call, see `_finish`."""
+
+    def solved(problem, initial, tolerance, field, energy):
+        begin = _begin(jnp, initial, field.origin, problem, plan)
+        state, stages = _all_stages(begin, tolerance, field, problem, energy, plan)
+        return _finish(jnp, state, stages, initial, problem, plan)
+
+    problem = _problem(key, reference, size=plan.num_coarse_queries)
+    return devices.mapped(solved)(problem, initial, tolerance, field, energy)
 
 
-def _problem(key, reference, size):
+@functools.partial(devices.quickly_compiled, static_argnames="size")
+def _problem(key, reference, *, size):
+    """The demonstration in blocks of `size` query points, in random order."""
     count = len(reference.query)
-    # numpy's stream differs from that of the starts: start m is drawn from fold_in(key, m).
-    shuffled = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel()).permutation(count)
+    # Start m is drawn from fold_in(key, m).
+    shuffled = jax.random.permutation(jax.random.fold_in(key, ORDER), count)
     shape = -(-count // size), size
     # Any query point pads the last block; it has no weight.
-    return gauss_newton.in_blocks(
-        reference, np.resize(shuffled, shape), (np.arange(np.prod(shape)) < count).reshape(shape)
+    counts = jnp.arange(math.prod(shape)).reshape(shape) < count
+    return gauss_newton.in_blocks(reference, jnp.resize(shuffled, shape), counts)
+
+
+# What follows computes with `xp`, which is jax.numpy where a call is traced. Otherwise it is numpy, because the poses
+# are a few hundred, and numpy needs no compilation.
+
+
+def _begin(xp, initial, origin, problem, plan):
+    # The starts and the demonstration share one program, which saves the compilation of a second one.
+    n = plan.num_poses
+    together = _candidates(xp, xp.concatenate([initial.reshape(-1, 7), xp.asarray(problem.target)]), problem)
+    drawn = Candidates(*(part[:-n].reshape(-1, n, *part.shape[1:]) for part in together[:2]))
+    demonstrated = Candidates(*(part[-n:] for part in together[:2]))
+    keyframe = (demonstrated.centroid[: plan.free] ** 2).sum(axis=1).argmin()
+    return _Begin(drawn, demonstrated, xp.asarray(origin), keyframe)
+
+
+def _candidates(xp, wxyz_xyz, problem):
+    R, translation = (xp.asarray(part(wxyz_xyz)) for part in (se3.rotation, se3.translation))
+    return Candidates(R, _rotated(R, xp.asarray(problem.centre)) + translation)
+
+
+def _poses(xp, candidates, problem):
+    centre = xp.asarray(problem.centre)
+    return xp.asarray(se3.pose(candidates.R, candidates.centroid - _rotated(candidates.R, centre)))
+
+
+def _rotated(R, x):
+    return (R * x[..., None, :]).sum(axis=-1)
+
+
+def _multiplied(R_a, R_b):
+    return (R_a[..., :, :, None] * R_b[..., None, :, :]).sum(axis=-2)
+
+
+def _blank(begin, plan):
+    """The state before the first stage."""
+    dtype, (rows, columns) = begin.drawn.R.dtype, plan.shape("search")
+    picked, searched = (plan.num_candidates, 1), (rows, columns)
+    return _State(
+        np.zeros((plan.room, 3, 3), dtype),
+        np.zeros((plan.room, 3), dtype),
+        np.full((plan.room, plan.length), np.inf, dtype),
+        np.zeros(plan.room, np.int32),
+        Candidates(np.zeros((*picked, 3, 3), dtype), np.zeros((*picked, 3), dtype)),
+        Candidates(
+            np.zeros((*searched, 3, 3), dtype), np.zeros((*searched, 3), dtype), np.full(searched, np.inf, dtype)
+        ),
     )
 
 
-def _candidates(wxyz_xyz, problem):
-    R = np.asarray(se3.rotation(wxyz_xyz))
-    return Candidates(R, R @ np.asarray(problem.centre) + np.asarray(se3.translation(wxyz_xyz)))
+def _enter(xp, stage, plan, state, begin):
+    """Poses that a stage begins with, and the waypoints that they match, (room, ...); and the state, updated."""
+    drawn, kept, alone = begin.drawn, plan.num_candidates, begin.keyframe
+    rows, columns = plan.shape(stage)
+    starts, waypoints = xp.arange(rows), xp.arange(columns)
+    if stage == "coarse":
+        entering, waypoints = Candidates(drawn.R[:rows, alone][:, None], drawn.centroid[:rows, alone][:, None]), alone
+    elif stage == "prune":
+        entering, chosen = _distinct(xp, _found(xp, "coarse", state, plan), rows)
+        starts, waypoints = chosen[:, 0], alone
+    elif stage == "search":
+        state = state._replace(picked=_distinct(xp, _found(xp, "prune", state, plan), kept)[0])
+        entering = Candidates(drawn.R[:rows, :columns], drawn.centroid[:rows, :columns])
+    elif stage == "propagate":
+        state = state._replace(searched=_found(xp, "search", state, plan))
+        entering = _propagated(xp, state.searched, state.picked, alone, begin.demonstrated, begin.origin)
+    else:
+        found = _found(xp, plan.stages[plan.stages.index(stage) - 1], state, plan)
+        if stage == "refine" and columns > 1:
+            found = Candidates(*(xp.concatenate(parts) for parts in zip(state.searched, found)))
+        entering, chosen = _distinct(xp, found, kept)
+        if plan.free == 1:
+            starts = state.starts[chosen[:, 0]]
+    waypoint = xp.broadcast_to(waypoints, (rows, columns)).ravel()
+    R, centroid = entering.R.reshape(-1, 3, 3), entering.centroid.reshape(-1, 3)
+    if stage == "polish":  # the fixed last pose, whose energy counts
+        R = xp.concatenate([R, drawn.R[0, columns:]])
+        centroid = xp.concatenate([centroid, drawn.centroid[0, columns:]])
+        waypoint = xp.concatenate([waypoint, xp.arange(columns, plan.num_poses)])
+    # What is beyond does not count.
+    R, centroid, waypoint = (xp.resize(part, (plan.room, *part.shape[1:])) for part in (R, centroid, waypoint))
+    starts = xp.resize(starts, plan.room).astype(np.int32)
+    return R, centroid, waypoint.astype(np.int32), state._replace(starts=starts)
 
 
-def _poses(candidates, problem):
-    return np.asarray(se3.pose(candidates.R, candidates.centroid - candidates.R @ np.asarray(problem.centre)))
+def _found(xp, stage, state, plan):
+    """The candidates at the end of a stage."""
+    shape = plan.shape(stage)
+
+    def grid(part):
+        return part[: math.prod(shape)].reshape(*shape, *part.shape[1:])
+
+    return Candidates(grid(state.R), grid(state.centroid), grid(_finite(xp, state.values[:, -1])))
 
 
-def _like(order, part):
-    return order.reshape(order.shape + (1,) * (part.ndim - 2))
+def _finite(xp, energies):
+    return xp.where(xp.isfinite(energies), energies, xp.inf)
 
 
-def _propagated(found, picked, keyframe, demonstrated, origin):
+def _propagated(xp, found, picked, keyframe, demonstrated, origin):
     """The demonstration, moved rigidly with the best pose of each waypoint, the best keyframes, and the centroids."""
     free = found.R.shape[1]
-    R_demonstrated, c_demonstrated = demonstrated.R[:free], demonstrated.centroid[:free] + np.asarray(origin)
-    best = found.energy.argmin(axis=0), np.arange(free)
+    R_demonstrated, c_demonstrated = demonstrated.R[:free], demonstrated.centroid[:free] + origin
+    best = found.energy.argmin(axis=0), xp.arange(free)
     # The waypoint that each motion is given by. The motion of the centroids alone leaves waypoint 0 where it is.
-    waypoint = np.concatenate([np.arange(free), np.full(len(picked.R), keyframe), [0]])
-    R = np.concatenate([found.R[best], picked.R[:, 0], R_demonstrated[:1]])
-    centroid = np.concatenate([found.centroid[best], picked.centroid[:, 0], c_demonstrated[:1]])
-    rotation = R @ R_demonstrated[waypoint].swapaxes(1, 2)
+    waypoint = xp.concatenate([xp.arange(free), xp.broadcast_to(keyframe, len(picked.R)), xp.zeros(1, int)])
+    R = xp.concatenate([found.R[best], picked.R[:, 0], R_demonstrated[:1]])
+    centroid = xp.concatenate([found.centroid[best], picked.centroid[:, 0], c_demonstrated[:1]])
+    rotation = _multiplied(R, R_demonstrated[waypoint].swapaxes(1, 2))[:, None]
     arms = c_demonstrated[None] - c_demonstrated[waypoint][:, None]
-    return Candidates(
-        rotation[:, None] @ R_demonstrated[None], np.einsum("rij,rwj->rwi", rotation, arms) + centroid[:, None]
-    )
+    return Candidates(_multiplied(rotation, R_demonstrated[None]), _rotated(rotation, arms) + centroid[:, None])
 
 
-def _distinct(found, kept):
+def _distinct(xp, found, kept):
     """The best distinct candidates of each waypoint, best first, and their rows (candidates, free waypoints).
 
     Where there are too few distinct ones, the next best follow.
     """
-    columns = []
-    for R, centroid, energy in zip(found.R.swapaxes(0, 1), found.centroid.swapaxes(0, 1), found.energy.T):
-        order, remaining = [], energy.copy()
-        for _ in range(kept):
-            best = int(remaining.argmin())
-            cosine = (np.einsum("rij,ij->r", R, R[best]) - 1) / 2
-            with np.errstate(over="ignore"):  # a start may lie anywhere
-                distance = np.linalg.norm(centroid - centroid[best], axis=1)
-            remaining[(cosine > np.cos(SAME_ANGLE)) & (distance < SAME_DISTANCE)] += 1e3
-            remaining[best] = np.inf
-            order.append(best)
-        columns.append((R[order], centroid[order], np.array(order)))
-    R, centroid, rows = (np.stack(part, axis=1) for part in zip(*columns))
-    return Candidates(R, centroid), rows
+    rows, columns = found.energy.shape
+    every, column = xp.arange(rows)[:, None], xp.arange(columns)
+
+    def choose(k, carry):
+        chosen, remaining = carry
+        best = remaining.argmin(axis=0)
+        cosine = ((found.R * found.R[best, column]).sum(axis=(2, 3)) - 1) / 2
+        with np.errstate(over="ignore"):  # a start may lie anywhere
+            distance = xp.linalg.norm(found.centroid - found.centroid[best, column], axis=2)
+        same = (cosine > COSINE_SAME) & (distance < SAME_DISTANCE)
+        remaining = xp.where(every == best, xp.inf, xp.where(same, remaining + 1e3, remaining))
+        return xp.where(xp.arange(kept)[:, None] == k, best, chosen), remaining
+
+    carry = xp.zeros((kept, columns), int), found.energy
+    if xp is jnp:
+        chosen, _ = jax.lax.fori_loop(0, kept, choose, carry)
+    else:
+        chosen, _ = functools.reduce(lambda carry, k: choose(k, carry), range(kept), carry)
+    return Candidates(found.R[chosen, column], found.centroid[chosen, column]), chosen
 
 
-def _run(stage, candidates, fixed=None, waypoints=None, *, shared, config, room, device_mesh):
-    """Run one stage.
+def _limits(plan, num_blocks, dtype):
+    """Arguments `bounds` and `damping` of `gauss_newton.descend`, a row for each stage."""
+    bounds = np.stack([plan.bounds(stage, num_blocks) for stage in plan.stages])
+    return bounds, np.array([FIRST_DAMPINGS[stage] for stage in plan.stages], dtype)
 
-    Args:
-        stage: name of the stage.
-        candidates: where it begins; its columns are all free waypoints, unless `waypoints` names others.
-        fixed: rotations and centroids of a last pose that is evaluated and does not move.
-        waypoints: indices of the waypoints of the columns.
-        shared: field, problem and weights.
-        config: settings.
-        room: number of poses that the program has room for.
-        device_mesh: devices that share the poses.
+
+def _all_stages(begin, tolerance, field, problem, energy, plan):
+    """All stages as one traced program, in which the descent occurs once.
 
     Returns:
-        The candidates at the end of the stage, and the energy of the fixed last pose, 0 if there is none.
+        The state at the end; energies (stages, room, length) and starts (stages, room) of every stage.
     """
-    rows, free = candidates.R.shape[:2]
-    R, centroid = candidates.R.reshape(-1, 3, 3), candidates.centroid.reshape(-1, 3)
-    waypoint = np.tile(np.arange(free) if waypoints is None else waypoints, rows)
-    if fixed is not None:
-        R, centroid = np.concatenate([R, fixed[0]]), np.concatenate([centroid, fixed[1]])
-        waypoint = np.concatenate([waypoint, np.arange(free, free + len(fixed[0]))])
-    count, steps = len(R), stage_steps(config)
-    # Every stage runs the same program: arrays of one size, and counts that are traced.
-    R, centroid, waypoint = (np.resize(part, (room, *part.shape[1:])) for part in (R, centroid, waypoint))
-    blocks = len(shared[1].query) if stage == "polish" else 1
-    bounds = np.array([rows * free, count, blocks, steps[stage]], np.int32)
-    given = (R, centroid, waypoint)
-    limits = (bounds, R.dtype.type(FIRST_DAMPINGS[stage]), R.dtype.type(config.tolerance))
-    dealt = np.arange(room)
+    branches = [functools.partial(_enter, jnp, stage, plan) for stage in plan.stages]
+
+    def run(state, which):
+        index, *limits = which
+        *given, state = jax.lax.switch(index, branches, state, begin)
+        R, centroid, values = gauss_newton.descend(
+            *given, *limits, tolerance, field, problem, energy, length=plan.length, chunk=plan.chunk
+        )
+        return state._replace(R=R, centroid=centroid, values=values), (values, state.starts)
+
+    limits = _limits(plan, len(problem.query), begin.drawn.R.dtype)
+    return jax.lax.scan(run, _blank(begin, plan), (np.arange(len(plan.stages)), *limits))
+
+
+def _stage_by_stage(begin, tolerance, field, problem, energy, plan, progress, device_mesh):
+    """As `_all_stages`, from the host."""
+    bounds, dampings = _limits(plan, len(problem.query), begin.drawn.R.dtype)
+    shared, dealt = (field, problem, energy), np.arange(plan.room)
     if device_mesh is not None:
         # The poses are dealt out in turn, so that every device has its share of those that move.
-        dealt = np.arange(room).reshape(-1, device_mesh.size).T.ravel()
-        given = devices.placed([part[dealt] for part in given], device_mesh, devices.sharded(device_mesh))
-        limits = devices.placed(limits, device_mesh)
-    chunk = config.chunk_queries or devices.points_at_a_time(CHUNK_POINTS)
-    length = max(steps.values()) + 1
-    results = gauss_newton.descend(*given, *limits, *shared, length=length, chunk=chunk, device_mesh=device_mesh)
-    R, centroid, values = (
-        devices.gathered(part)[np.argsort(dealt)] if device_mesh is not None else np.asarray(part) for part in results
+        dealt = dealt.reshape(-1, plan.parts).T.ravel()
+        shared = devices.placed(shared, device_mesh)
+    state, values, starts = _blank(begin, plan), [], []
+    for index, stage in enumerate(plan.stages):
+        *given, state = _enter(np, stage, plan, state, begin)
+        limits = bounds[index], dampings[index], tolerance
+        if device_mesh is not None:
+            given = devices.placed([part[dealt] for part in given], device_mesh, devices.sharded(device_mesh))
+            limits = devices.placed(limits, device_mesh)
+        ended = gauss_newton.descend(
+            *given, *limits, *shared, length=plan.length, chunk=plan.chunk, device_mesh=device_mesh
+        )
+        ended = [devices.gathered(part)[np.argsort(dealt)] for part in ended]
+        state = state._replace(**dict(zip(("R", "centroid", "values"), ended)))
+        values.append(state.values)
+        starts.append(state.starts)
+        if progress is not None:
+            energies = np.sort(_found(np, stage, state, plan).energy, axis=0)
+            progress(sum(plan.steps[: STAGES.index(stage) + 1]), energies[: plan.num_candidates].mean(axis=1))
+    return state, (values, starts)
+
+
+def _finish(xp, state, stages, initial, problem, plan):
+    """The result of all stages.
+
+    Returns:
+        Trajectories, (candidates, poses, 7); their energies before each step and after the last, (candidates, steps +
+        1); energies of every start before each step, (starts, steps), NaN, or infinite if traced, where they are not
+        known.
+    """
+    values, starts = (dict(zip(plan.stages, part)) for part in stages)
+    n, free, kept = plan.num_poses, plan.free, plan.num_candidates
+
+    def course(stage):
+        """Energies (rows, columns, times) during a stage."""
+        rows, columns = plan.shape(stage)
+        energies = values[stage][: rows * columns, : plan.num_steps(stage) + 1]
+        return _finite(xp, energies).reshape(rows, columns, -1)
+
+    def best(stage, *others):
+        """Energies (candidates, times) of the best candidates of each waypoint; those of `others` are constant."""
+        energies = course(stage)
+        rows = [energies, *(xp.broadcast_to(other, (*other.shape[:2], energies.shape[2])) for other in others)]
+        ordered = xp.sort(xp.concatenate(rows), axis=0)
+        return ordered[np.minimum(np.arange(kept), len(ordered) - 1)].sum(axis=1)
+
+    fixed = _finite(xp, values["polish"][kept * free : kept * free + n - free, -1]).sum()
+    curves = [best(stage) for stage in plan.stages[:-1] if free == 1 or stage not in ("coarse", "prune", "propagate")]
+    if free > 1:
+        curves.insert(1, best("propagate", course("search")[:, :, -1:]))
+    last, ended = course("polish"), _found(xp, "polish", state, plan)
+    order = xp.argsort(ended.energy, axis=0)
+    curves = [*(curve[:, :-1] for curve in curves), xp.take_along_axis(last, order[:, :, None], axis=0).sum(axis=1)]
+    losses = (xp.concatenate(curves, axis=1) + fixed) / n
+
+    history = []
+    for stage in plan.stages if free == 1 else ("search",):
+        energies = (course(stage)[:, :, :-1].sum(axis=1) + fixed) / n
+        follows = starts[stage][: len(energies), None] == np.arange(len(initial))
+        unknown = xp.inf if xp is jnp else np.nan
+        history.append(xp.where(follows.any(axis=0)[:, None], energies[follows.argmax(axis=0)], unknown))
+    # Several waypoints are followed as trajectories in the search only.
+    rest = losses.shape[1] - 1 - sum(part.shape[1] for part in history)
+    history = xp.pad(xp.concatenate(history, axis=1), ((0, 0), (0, rest)), constant_values=unknown)
+
+    ordered = Candidates(
+        xp.take_along_axis(ended.R, order[:, :, None, None], axis=0),
+        xp.take_along_axis(ended.centroid, order[:, :, None], axis=0),
     )
-    history = values.T[: steps[stage] + 1]
-    history = np.where(np.isfinite(history), history, np.inf)
-    ended = [part[: rows * free].reshape(rows, free, *part.shape[1:]) for part in (R, centroid)]
-    energies = history[:, : rows * free].reshape(len(history), rows, free)
-    return Candidates(ended[0], ended[1], energies[-1], energies), history[-1, rows * free : count].sum()
+    ends = xp.broadcast_to(initial[:1, free:], (kept, n - free, 7))
+    trajectories = xp.concatenate([_poses(xp, ordered, problem), ends], axis=1)
+    return tuple(part.astype(initial.dtype) for part in (trajectories, losses, history))

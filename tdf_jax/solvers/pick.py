@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from tdf_jax._internal import checks
-from tdf_jax._internal.boundary import host
+from tdf_jax._internal.boundary import public
 from tdf_jax._internal.deprecation import renamed_fields, renamed_keywords
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference
-from tdf_jax.energy.residual import pick_residual
+from tdf_jax.energy.residual import pick_residual, traced_pick_residual
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.geometry.transport import carry_to_picks
 from tdf_jax.networks.field import DescriptorField
@@ -87,7 +87,7 @@ class CarryConfig:
         return SolveConfig(num_trajectory_starts=1, search_steps=1, propagate_steps=1, **settings)
 
 
-@host
+@public
 @renamed_keywords(mesh="device_mesh")
 def carry(
     field: DescriptorField,
@@ -101,6 +101,8 @@ def carry(
     device_mesh: jax.sharding.Mesh | None = None,
 ) -> Result:
     """Find the pick by its descriptors (eq. 2 of one waypoint) and warp the demonstration from there to the goal.
+
+    Any array may be traced by `jax.jit` and `jax.vmap`, as in `solve`.
 
     Args:
         field: descriptor field of the new object.
@@ -142,11 +144,12 @@ def carry(
     picks = jnp.concatenate([result.trajectories[:, 0], result.initial_trajectories[:, 0]])
     trajectories = carry_to_picks(reference.trajectory, picks, goal)
     count = len(result.trajectories)
-    residual = pick_residual(float(result.loss), pick.descriptors[0]) if result.finite.any() else np.nan
+    if checks.traced(result.energies, reference.descriptors):
+        residual = traced_pick_residual(jnp.min(result.energies), pick.descriptors[0])
+    else:
+        residual = pick_residual(float(result.loss), pick.descriptors[0]) if result.finite.any() else np.nan
+        residual = np.asarray(residual, result.energies.dtype)
     result = dataclasses.replace(
-        result,
-        trajectories=trajectories[:count],
-        initial_trajectories=trajectories[count:],
-        residual=np.asarray(residual, result.energies.dtype),
+        result, trajectories=trajectories[:count], initial_trajectories=trajectories[count:], residual=residual
     )
     return with_ends(result, reference)

@@ -83,8 +83,9 @@ class Result:
             `solve` and `carry`, row k holds the energies of the k-th best candidates at that step, on the coarse query
             points.
         initial_trajectories: initial poses of every start, (starts, poses, 7), T_world_query.
-        history: energy of every start before each step, (starts, steps); NaN where the solver does not follow the
-            start. Of several waypoints `solve` follows the starts as trajectories in the search stage only.
+        history: energy of every start before each step, (starts, steps); NaN, or infinite in a traced call, where the
+            solver does not follow the start. Of several waypoints `solve` follows the starts as trajectories in the
+            search stage only.
         residual: normalised descriptor energy of the best pick of `carry`, see `tdf_jax.confidence`; a scalar, NaN for
             other solvers.
         confidence: probability that the pick is right, in [0, 1], see `tdf_jax.confidence`; a scalar, set by `imitate`

@@ -1,5 +1,6 @@
 """Rows that are no measurements are counted, refused, or removed; ordinary duplicates stay."""
 
+import jax
 import numpy as np
 import pytest
 from conftest import random_cloud
@@ -7,6 +8,7 @@ from conftest import random_cloud
 import tdf_jax as tdf
 from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
+from tdf_jax.geometry import sampling
 
 CLOUD = random_cloud(0, 600)
 
@@ -84,3 +86,17 @@ def test_clouds_of_other_shapes_are_refused_with_the_fix():
     for shape, fix in (((3, 50), "points.T"), ((5, 10, 3), r"reshape\(-1, 3\)"), ((50, 6), r"points\[:, :3\]")):
         with pytest.raises(InputError, match=fix):
             checks.points("f()", np.ones(shape))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_same_points_of_a_traced_cloud_are_chosen(seed):
+    cloud = random_cloud(seed, 600).astype(np.float32)
+    cloud[300:320] = cloud[:20]  # coincident points
+    found = jax.jit(sampling.traced_farthest_point_indices, static_argnums=1)(cloud, 200)
+    np.testing.assert_array_equal(found, sampling.farthest_point_indices(cloud, 200))
+
+
+def test_subsamples_of_a_traced_cloud_are_those_of_a_known_one():
+    cloud = random_cloud(0, 600).astype(np.float32)
+    found = jax.jit(lambda points: sampling.subsamples(points, 40, 3))(cloud)
+    np.testing.assert_array_equal(found, sampling.subsamples(cloud, 40, 3))

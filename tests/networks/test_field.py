@@ -293,9 +293,42 @@ def test_a_cloud_hardly_denser_gives_one_subsample():
     assert len(subsamples(points, 20, 8)) == 8
 
 
-def test_subsampling_is_refused_where_it_cannot_be_done(subsampling_model):
-    with pytest.raises(InputError, match="90 points cannot be subsampled to 24 under jax.jit"):
-        jax.jit(lambda points: tdf.encode(subsampling_model, points).latent)(random_cloud(0, 90))
+def test_a_traced_cloud_is_subsampled_as_a_known_one(subsampling_model):
+    clouds = np.stack([random_cloud(seed, 90) for seed in (0, 1)]).astype(np.float32)
+
+    @jax.jit
+    @jax.vmap
+    def batch(points):
+        field = tdf.encode(subsampling_model, points)
+        return field.latent, field.origin
+
+    latents, origins = batch(clouds)
+    for index, cloud in enumerate(clouds):
+        field = tdf.encode(subsampling_model, cloud)
+        # The traced cloud is centred in float32.
+        np.testing.assert_allclose(latents[index], field.latent, atol=1e-5 * np.abs(field.latent).max())
+        np.testing.assert_allclose(origins[index], field.origin, atol=1e-7)
+
+
+def test_a_traced_cloud_that_is_subsampled_has_a_gradient(subsampling_model):
+    """The points that are chosen move, and the choice does not."""
+    cloud = random_cloud(0, 90).astype(np.float32)
+    slope = jax.jit(jax.grad(lambda points: jnp.sum(tdf.encode(subsampling_model, points).origin)))(cloud)
+    np.testing.assert_allclose(slope.sum(axis=0), 1, atol=1e-5)
+    assert (np.asarray(slope) >= 0).all()
+
+
+def test_a_known_cloud_is_encoded_while_a_function_is_traced(subsampling_model):
+    cloud = random_cloud(0, 90).astype(np.float32)
+    cloud[5] = 40.0  # far from all else
+    field, kept = tdf.encode(subsampling_model, cloud, return_kept=True)
+    inside, kept_inside = jax.jit(lambda: tdf.encode(subsampling_model, cloud, return_kept=True))()
+    np.testing.assert_array_equal(inside.latent, field.latent)
+    np.testing.assert_array_equal(kept_inside, kept)
+    assert not kept[5] and kept.sum() == 89
+
+
+def test_a_negative_number_of_subsamples_is_refused(subsampling_model):
     with pytest.raises(InputError, match="num_subsamples is -1"):
         tdf.encode(subsampling_model, random_cloud(0, 90), num_subsamples=-1)
 

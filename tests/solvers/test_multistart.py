@@ -1,6 +1,7 @@
 """The solver: its quadratic model, what passes from stage to stage, that it finds what `optimize` finds."""
 
 import dataclasses
+import operator
 import sys
 
 import jax
@@ -71,10 +72,10 @@ def moved(R, place, step):
 def test_energies_and_gradients_are_those_of_the_energy(field, reference, pose_norm):
     """All 8 query points, in blocks of 3: the last block is filled up with a point that must not count."""
     weights = tdf.EnergyWeights(0.3, 0.0, 0.2, pose_norm)
-    problem = solve._problem(KEY, reference, 3)
+    problem = solve._problem(KEY, reference, size=3)
     assert problem.query.shape == (3, 3, 3) and problem.weights.sum() == 8
     starts = random_starts(KEY, field, reference, 5, "scattered", 0.1)
-    drawn = solve._candidates(starts, problem)
+    drawn = solve._candidates(np, starts, problem)
     R, place = drawn.R.reshape(-1, 3, 3), drawn.centroid.reshape(-1, 3)
     waypoint = np.tile(np.arange(4), 5)
     values = evaluate(R, place, waypoint, np.array([20, 20, 3, 0]), field, problem, weights, 128)
@@ -117,10 +118,10 @@ def test_differences_of_poses_and_their_gradients_are_those_of_the_energy(refere
 
 
 def test_the_curvature_is_that_of_reweighted_squares(field, reference):
-    problem = solve._problem(KEY, reference, 8)
+    problem = solve._problem(KEY, reference, size=8)
     R, place = (
         jnp.asarray(part[0, :1])
-        for part in solve._candidates(random_starts(KEY, field, reference, 1, "scattered", 0.1), problem)[:2]
+        for part in solve._candidates(np, random_starts(KEY, field, reference, 1, "scattered", 0.1), problem)[:2]
     )
     shown = problem.descriptors[:1, 0]
 
@@ -162,8 +163,8 @@ def test_a_step_solves_the_damped_system_and_is_bounded():
 
 @pytest.mark.slow
 def test_chunks_do_not_show(field, reference):
-    problem = solve._problem(KEY, reference, 3)
-    drawn = solve._candidates(random_starts(KEY, field, reference, 2, "carried", 0.1), problem)
+    problem = solve._problem(KEY, reference, size=3)
+    drawn = solve._candidates(np, random_starts(KEY, field, reference, 2, "carried", 0.1), problem)
     settings = (
         drawn.R.reshape(-1, 3, 3),
         drawn.centroid.reshape(-1, 3),
@@ -183,17 +184,17 @@ def test_chunks_do_not_show(field, reference):
 # ---- from stage to stage ----
 
 
-def test_carried_candidates_are_rigid_motions_of_the_demonstration(field, reference):
-    problem = solve._problem(KEY, reference, 8)
+@pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "traced"])
+def test_carried_candidates_are_rigid_motions_of_the_demonstration(field, reference, xp):
+    problem = solve._problem(KEY, reference, size=8)
     starts = random_starts(KEY, field, reference, 4, "scattered", 0.1)
-    drawn = solve._candidates(starts, problem)
+    drawn = solve._candidates(np, starts, problem)
     energy = np.random.default_rng(0).uniform(size=(4, 3))
-    found = Candidates(drawn.R[:, :3], drawn.centroid[:, :3], energy)
-    picked = Candidates(drawn.R[2:, 1:2], drawn.centroid[2:, 1:2])
-    shown_candidates = solve._candidates(reference.trajectory.wxyz_xyz, problem)
-    new = np.array(
-        solve._poses(solve._propagated(found, picked, 1, shown_candidates, field.origin), problem), np.float64
-    )
+    found = Candidates(*map(xp.asarray, (drawn.R[:, :3], drawn.centroid[:, :3], energy)))
+    picked = Candidates(*map(xp.asarray, (drawn.R[2:, 1:2], drawn.centroid[2:, 1:2])))
+    shown_candidates = solve._candidates(np, reference.trajectory.wxyz_xyz, problem)
+    propagated = solve._propagated(xp, found, picked, 1, shown_candidates, xp.asarray(field.origin))
+    new = np.array(solve._poses(xp, propagated, problem), np.float64)
     assert new.shape == (6, 3, 7)
     shown = np.array(reference.trajectory.shifted(field.origin).wxyz_xyz[:3], np.float64)
     for index, (row, waypoint) in enumerate(
@@ -211,19 +212,22 @@ def test_carried_candidates_are_rigid_motions_of_the_demonstration(field, refere
     np.testing.assert_allclose(np.abs(new[5]), np.abs(shown), atol=2e-6)
 
 
-def test_distinct_candidates_are_the_best_of_each_waypoint():
+@pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "traced"])
+def test_distinct_candidates_are_the_best_of_each_waypoint(xp):
     turns = Rotation.from_rotvec([[0, 0, 0], [0.05, 0, 0], [0.5, 0, 0], [0, 0, 0]]).as_matrix()
+    turns = np.float32(turns)
     R = np.stack([turns, turns], axis=1)
-    place = np.zeros((4, 2, 3))
+    place = np.zeros((4, 2, 3), np.float32)
     place[3, :, 0] = 0.05
     energy = np.array([[0.2, 0.4], [0.1, 0.3], [0.4, 0.2], [0.3, 0.1]])
-    best, rows = solve._distinct(Candidates(R, place, energy), 3)
+    found = Candidates(*map(xp.asarray, (R, place, energy)))
+    best, rows = solve._distinct(xp, found, 3)
     # Candidates 0 and 1 are 3 degrees apart and count as one.
     for waypoint, expected in enumerate([[1, 3, 2], [3, 2, 1]]):
         np.testing.assert_array_equal(best.R[:, waypoint], turns[expected])
         np.testing.assert_array_equal(best.centroid[:, waypoint], place[expected, waypoint])
         np.testing.assert_array_equal(rows[:, waypoint], expected)
-    most, _ = solve._distinct(Candidates(R, place, energy), 4)
+    most, _ = solve._distinct(xp, found, 4)
     np.testing.assert_array_equal(most.R[3, 0], turns[0])  # none distinct is left
 
 
@@ -384,7 +388,100 @@ def test_stages_and_what_is_traced_share_one_program(small_model, field, referen
                 energy=tdf.EnergyWeights(correlation=weight, rotation_scale=weight),
             )
         run(field, reference, config=dataclasses.replace(CONFIG, tolerance=0.1))
-    assert not {"jit(descend)", "jit(in_blocks)", "jit(_random_starts)"} & set(compiled)
+    assert not {"jit(descend)", "jit(_problem)", "jit(_random_starts)"} & set(compiled)
+
+
+# ---- inside of functions that are traced ----
+
+
+NAMES = ("trajectories", "energies", "candidate_history", "initial_trajectories")
+
+
+def parts(result):
+    """Arrays of a result; where a start is not followed, its history is infinite, as that of a traced call is."""
+    known = isinstance(result.history, np.ndarray)
+    history = np.where(np.isnan(result.history), np.inf, result.history) if known else result.history
+    return *(getattr(result, name) for name in NAMES), history
+
+
+def assert_equal_parts(found, expected):
+    for one, other, name in zip(found, expected, (*NAMES, "history"), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=2e-5, err_msg=name)
+
+
+@pytest.fixture(scope="module")
+def worlds(small_model, demonstration):
+    """Fields of two objects and references of two demonstrations, stacked."""
+    fields = [tdf.encode(small_model, jnp.asarray(random_cloud(seed), jnp.float32)) for seed in (3, 30)]
+    shown = [
+        tdf.describe(small_model, dataclasses.replace(demonstration, query=demonstration.query + offset))
+        for offset in (0.0, 0.01)
+    ]
+    return [jax.tree.map(lambda *leaves: jnp.stack(leaves), *pair) for pair in (fields, shown)]
+
+
+def test_a_batch_over_anything_is_that_of_single_calls_and_is_traced_once(worlds):
+    fields, references = worlds
+    traces = []
+
+    @jax.jit
+    @jax.vmap
+    def batch(field, reference, key, goal, weight):
+        traces.append(None)
+        energy = tdf.EnergyWeights(correlation=weight, rotation_scale=0.2)
+        return parts(run(field, reference, key=key, goal=goal, energy=energy))
+
+    for seed in (0, 1):
+        keys = jax.random.split(jax.random.key(seed), 2)
+        goals = jnp.asarray(random_poses(seed, 2), jnp.float32)
+        weights = jnp.array([0.3, 0.2]) + 0.1 * seed
+        with compilations() as compiled:
+            found = batch(fields, references, keys, goals, weights)
+        for index in range(2):
+            field, reference = (jax.tree.map(operator.itemgetter(index), tree) for tree in worlds)
+            energy = tdf.EnergyWeights(correlation=weights[index], rotation_scale=0.2)
+            expected = parts(run(field, reference, key=keys[index], goal=goals[index], energy=energy))
+            assert_equal_parts([part[index] for part in found], expected)
+    assert traces == [None] and compiled == []
+
+
+def test_a_batch_in_which_only_keys_differ(field, reference):
+    keys = jax.random.split(KEY, 2)
+    found = jax.vmap(lambda key: parts(run(field, reference, key=key)))(keys)
+    for index, key in enumerate(keys):
+        assert_equal_parts([part[index] for part in found], parts(run(field, reference, key=key)))
+
+
+@pytest.mark.slow
+def test_a_batch_on_an_accelerator_is_computed_together(monkeypatch, field, reference):
+    """There `devices.mapped` leaves the batch to `jax.vmap`."""
+    monkeypatch.setattr("tdf_jax._internal.devices.one_at_a_time", lambda: False)
+    config = dataclasses.replace(CONFIG, chunk_queries=64)  # a program of its own
+    keys = jax.random.split(KEY, 2)
+    found = jax.jit(jax.vmap(lambda key: parts(run(field, reference, key=key, config=config))))(keys)
+    for index, key in enumerate(keys):
+        expected = parts(run(field, reference, key=key, config=config))
+        assert_equal_parts([part[index] for part in found], expected)
+
+
+@pytest.mark.slow
+def test_known_numbers_and_starts_inside_of_a_traced_function(field, reference, result):
+    starts = random_starts(KEY, field, reference, 3, "carried", 0.1).at[:, -1].set(default_goal(field, reference))
+    inside = jax.jit(lambda: (parts(run(field, reference)), parts(run(field, reference, starts=starts))))()
+    assert_equal_parts(inside[0], parts(result))
+    assert_equal_parts(inside[1], parts(run(field, reference, starts=starts)))
+
+
+def test_what_a_traced_call_cannot_do_is_refused(field, reference):
+    def refused(match, **settings):
+        with pytest.raises(InputError, match=match):
+            jax.jit(lambda key: run(field, reference, key=key, **settings).energies)(KEY)
+
+    refused(r"solve\(\): there is a progress, and the call is traced", progress=print)
+    device_mesh = jax.make_mesh((1,), ("starts",))
+    refused(r"solve\(\): there is a device_mesh, and the call is traced", device_mesh=device_mesh)
+    with pytest.raises(InputError, match=r"energy.compensator is traced; expected 0"):
+        jax.jit(lambda energy: run(field, reference, energy=energy).energies)(tdf.EnergyWeights())
 
 
 # ---- bad input ----

@@ -221,6 +221,40 @@ def test_without_a_finite_start_the_result_says_so(monkeypatch, field, reference
     assert np.isnan(found.residual) and "non-finite" in found.status
 
 
+def carried_parts(field, reference, key, goal):
+    result = tdf.carry(field, reference, key, goal=goal, config=CONFIG)
+    return result.trajectories, result.energies, result.residual, result.candidate_history, result.pick, result.loss
+
+
+def test_from_a_cloud_to_trajectories_in_a_batch_that_is_traced_once(small_model, reference):
+    """Clouds, denser than the network's, keys and goals are traced: `encode` and `carry` are one program."""
+    model = dataclasses.replace(small_model, info=dataclasses.replace(small_model.info, cloud_points=24))
+    traces = []
+
+    @jax.jit
+    @jax.vmap
+    def batch(points, key, goal):
+        traces.append(None)
+        return carried_parts(tdf.encode(model, points), reference, key, goal)
+
+    for seed in (0, 1):
+        clouds = np.stack([random_cloud(10 * seed + index, 90) for index in range(2)]).astype(np.float32)
+        keys, goals = jax.random.split(jax.random.key(seed), 2), jnp.asarray(random_poses(seed, 2), jnp.float32)
+        found = batch(clouds, keys, goals)
+        for index in range(2):
+            expected = carried_parts(tdf.encode(model, clouds[index]), reference, keys[index], goals[index])
+            for one, other in zip(found, expected, strict=True):
+                np.testing.assert_allclose(one[index], other, rtol=1e-3, atol=1e-4)
+    assert traces == [None]
+
+
+@pytest.mark.slow
+def test_a_traced_reference_of_one_query_point_has_no_residual(small_model, field, demonstration):
+    reference = tdf.describe(small_model, dataclasses.replace(demonstration, query=demonstration.query[:1]))
+    found = jax.jit(lambda reference: tdf.carry(field, reference, KEY, config=CONFIG).residual)(reference)
+    assert np.isinf(found)
+
+
 def test_imitate_carries_by_default(small_model, demonstration, reference, field, result):
     found = tdf.imitate(small_model, demonstration, random_cloud(3).astype(np.float32), key=KEY, config=CONFIG)
     np.testing.assert_array_equal(found.trajectories, result.trajectories)
