@@ -7,7 +7,6 @@ M = A_t D inverse(A_o).
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -545,7 +544,7 @@ def _moved(points, motion):
     return points @ R.T + np.asarray(motion, float)[4:]
 
 
-@functools.partial(jax.jit, compiler_options=devices.FAST_COMPILATION)
+@devices.quickly_compiled
 def _carried(path: Trajectory, released_contact, picks, motions, target_contacts, arrival, deeper):
     def one(pick, motion, target_contact, deeper):
         target_motion = se3.compose(target_contact, se3.inverse(released_contact))

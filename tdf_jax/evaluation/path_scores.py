@@ -19,7 +19,7 @@ from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.networks.model import Model, fingerprint
 from tdf_jax.uncertainty.calibration import confidence
 
-FORMAT = 1  # format number; raise it when the computation of an attempt changes
+FORMAT = 2  # format number; raise it when the computation of an attempt changes
 LEAST_JERK = 1e-4  # smallest denominator of a ratio of jerks, metres
 
 

@@ -28,7 +28,7 @@ from tdf_jax.networks.model import Model, fingerprint
 from tdf_jax.relation import Objects, Relations, find_relations, kept_points
 from tdf_jax.solvers.pick import CarryConfig
 
-FORMAT = 11  # format number; raise it when the computation of a placement or of its verdict changes
+FORMAT = 12  # format number; raise it when the computation of a placement or of its verdict changes
 LIBRARY, UNSEATED = "tdf_jax", "unseated"
 METHODS = (LIBRARY, UNSEATED, "ICP", "centroids")
 DEMONSTRATIONS = 10  # pairs that demonstrate; with one demonstration, each is that of a tenth of the tests
