@@ -25,7 +25,7 @@ from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.model import Model, fingerprint
 from tdf_jax.solvers.pick import carry
 
-FORMAT = 1  # format number of the stored results
+FORMAT = 2  # format number of the stored results
 # Number of the first demonstrated mug, so that no task has it; and the most demonstrated mugs of a task.
 MUGS, MOST = 1_000_000_000, 100
 POINTS = 1500
