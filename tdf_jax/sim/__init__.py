@@ -20,7 +20,7 @@ Modules:
     motion: motions of a robot along a trajectory, from home to home
     execution: a joint trajectory in physics
     pads: flat pads, and the turn at which what they clamp lies flush with them
-    necks: how deep pads hold a neck, and how far they open for it
+    necks: how pads hold a neck, and a neck in a cloud
     grasps: grasps of generated objects that a demonstration shows
     grasping: whether a grasp holds an object that is lifted and turned
     centring: a grasp in the middle of what is between the fingers

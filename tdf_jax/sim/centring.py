@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import least_squares
 
 from tdf_jax.sim import necks
 from tdf_jax.sim.grasps import CLEARANCE
@@ -25,17 +24,6 @@ OUTLIERS, NEAR = 2.5, 0.0004
 LEAST_OF_WALL, LEAST_OF_SIDE = 10, 6  # points for a fit, and on both sides for a taper
 GRID = 0.001  # metres between points of the fitted surfaces
 FLUSH = 0.005  # radians; a smaller turn ends the search
-# A neck is round about an axis to this, metres, in the median; its radius is linear between levels so far apart.
-ROUND_TO, KNOTS, LEAST_OF_NECK = 0.001, 0.004, 16
-NOISE = 0.001  # metres; points further from a neck count less
-STEEPEST_NECK = np.radians(20)
-BELOW_NECK = 0.02  # metres beyond the tips; descriptors know the axis of a neck better than the height on it
-GAP = 0.008  # metres along a neck without points, beyond which is something else
-FINE, SMOOTH = 0.003, 0.2  # metres between the knots of a neck's radii, and the weight of their bends
-TOUCHED = 0.0006  # metres, as in `necks`, of widths by points
-ALONG, WORTH = 0.04, 0.03  # metres: largest movement along a neck, and the one for which pads must hold e times better
-# Sine of the tilt of a neck from which on the turn about it matters, and turns about the best one, radians.
-TILTED, OFF_PLANE = 0.02, tuple(np.radians([0.0, 5.0, -5.0]))
 FINGER, CLOSE_BY, FARTHEST = 0.010, 0.001, 0.015  # metres: thickness of a finger, clearance, and largest withdrawal
 
 
@@ -79,7 +67,7 @@ def centred(
     """
     T = np.array(T_world_grip, float)
     points = np.asarray(points, float)
-    grasps = _on_neck(T, points, opening, fingers)
+    grasps = necks.neck_grasps(T, points, opening, fingers)
     if not grasps:
         grasps = [_on_wall(T, points, opening, fingers)]
     return [Centred(_withdrawn(T, points, gap, fingers.tip(gap)), gap) for T, gap in grasps]
@@ -135,114 +123,6 @@ def _between(T, points, beside: float, opening: float, tip: float):
     x, y, z = ((points - T[:3, 3]) @ T[:3, :3]).T
     inside = (np.abs(x) < beside) & (np.abs(y) < opening / 2) & (z > tip - 2 * TIPS) & (z < tip + BEYOND)
     return x[inside], y[inside], z[inside]
-
-
-def _on_neck(T, points, opening: float, fingers: Fingers) -> list[tuple[np.ndarray, float]]:
-    """Grasps along the axis of a round neck, as deep as pads hold best, and their opening; none if there is no neck."""
-    held = None
-    for _ in range(2):  # again at the depth that was found, where the axis is measured
-        tip = fingers.tip(max(opening - 2 * necks.CLEARANCE, 0.0))
-        found = [_along_neck(T, points, fingers.widest, tip, beyond) for beyond in (BELOW_NECK, BEYOND)]
-        aligned, misfit = min(found, key=lambda one: one[1])
-        if not np.isfinite(misfit):
-            break
-        deepened = _deepened(aligned, points, tip, fingers)
-        if deepened is None:
-            break
-        T, opening = held = deepened
-    return [] if held is None else [(turned, opening) for turned in _about_neck(T)]
-
-
-def _deepened(T, points, tip: float, fingers: Fingers) -> tuple[np.ndarray, float] | None:
-    """A grasp along the axis of a neck, moved along it to where pads hold best, and the opening there."""
-    x, y, z = ((points - T[:3, 3]) @ T[:3, :3]).T
-    radii = np.hypot(x, y)
-    along = np.sort(z[radii < fingers.widest / 2])
-    ends = np.flatnonzero((np.diff(along) > GAP) & (along[:-1] < tip))
-    end = float(along[ends[-1] + 1 if len(ends) else 0])
-    levels = np.arange(necks.LEVEL_STEP, necks.DEPTHS[1], necks.LEVEL_STEP)
-    widths = 2 * _profile(z - end, radii, levels)
-    holds = necks.neck_holds(levels, widths, float(z.mean()) - end, fingers.widest, TOUCHED)
-    moves = [end + one.depth - fingers.tip(one.width) for one in holds]
-    reached = [number for number, move in enumerate(moves) if abs(move) < ALONG]
-    if not reached:
-        return None
-    best = max(reached, key=lambda number: holds[number].score * np.exp(-abs(moves[number]) / WORTH))
-    T = T.copy()
-    T[:3, 3] += moves[best] * T[:3, 2]
-    return T, holds[best].opening
-
-
-def _about_neck(T) -> list[np.ndarray]:
-    """A grasp, turned about its approach to where what it holds swings least, the best first."""
-    along, closing = T[2, 0], T[2, 1]  # the vertical, in the gripper's frame
-    if np.hypot(along, closing) < TILTED:
-        return [T]
-    plane = np.arctan2(-along, closing)  # from the closing direction
-    plane -= np.pi * np.round(plane / np.pi)  # the same gripper, half a turn about
-    grasps = []
-    for angle in plane + np.array(OFF_PLANE):
-        turn, (cos, sin) = np.eye(4), (np.cos(angle), np.sin(angle))
-        turn[:2, :2] = [[cos, -sin], [sin, cos]]
-        grasps.append(T @ turn)
-    return grasps
-
-
-def _profile(heights, radii, levels) -> np.ndarray:
-    """Radii at levels, linear between `KNOT` metres, of points of a round body; points off it count little."""
-    knots = np.arange(0.0, levels[-1] + FINE, FINE)
-    inside = (heights > -FINE) & (heights < knots[-1])
-    heights, radii = heights[inside], radii[inside]
-    rows = np.stack([np.interp(heights, knots, row) for row in np.eye(len(knots))], axis=1)
-    bend = SMOOTH * np.diff(np.eye(len(knots)), n=2, axis=0)
-    weights, fit = np.ones(len(radii)), np.zeros(len(knots))
-    for _ in range(10):
-        rows_of, values = (
-            np.concatenate([weights[:, None] * rows, bend]),
-            np.concatenate([weights * radii, np.zeros(len(bend))]),
-        )
-        fit = np.linalg.lstsq(rows_of, values, rcond=None)[0]
-        weights = np.sqrt(1 / np.maximum(np.abs(radii - rows @ fit), NOISE / 4))
-        weights /= weights.max()
-    return np.interp(levels, knots, fit)
-
-
-def _along_neck(T, points, widest: float, tip: float, beyond: float):
-    """Turn and move a grasp so that its approach is the axis of a round neck, and the misfit; inf if there is none."""
-    last = np.inf
-    for _ in range(2):
-        x, y, z = ((points - T[:3, 3]) @ T[:3, :3]).T
-        inside = (np.hypot(x, y) < widest / 2) & (z > tip - 2 * TIPS) & (z < tip + beyond)
-        x, y, z = x[inside], y[inside], z[inside]
-        if len(y) < LEAST_OF_NECK or np.ptp(z) < SPREAD:
-            break
-        centre = float(z.mean())
-        at, axis, misfit = _axis(x, y, z - centre)
-        if misfit > ROUND_TO or axis[2] < np.cos(STEEPEST_NECK) or np.hypot(*at) > LONGEST:
-            break
-        across = np.cross(axis, (1.0, 0.0, 0.0))
-        across /= np.linalg.norm(across)
-        turn = np.eye(4)
-        turn[:3, :3] = np.stack([np.cross(across, axis), across, axis], axis=1)
-        turn[:3, 3] = np.array([*at, centre]) - turn[:3, :3] @ (0.0, 0.0, centre)
-        T, last = T @ turn, misfit
-    return T, last
-
-
-def _axis(x, y, z) -> tuple[np.ndarray, np.ndarray, float]:
-    """Where the axis of a round body is at z = 0, (2,), its direction, (3,), and the median distance of its points."""
-    levels = max(2, int(np.ptp(z) / KNOTS) + 1)
-    knots = np.linspace(z.min(), z.max(), levels)
-    share = np.stack([np.interp(z, knots, row) for row in np.eye(levels)], axis=1)
-
-    def errors(fit):
-        return np.hypot(x - fit[0] - fit[1] * z, y - fit[2] - fit[3] * z) - share @ fit[4:]
-
-    start = np.concatenate([[x.mean(), 0, y.mean(), 0], np.full(levels, np.hypot(x, y).mean())])
-    fit = least_squares(errors, start, loss="soft_l1", f_scale=NOISE).x
-    fit = least_squares(errors, fit, loss="cauchy", f_scale=NOISE / 4).x  # points of the end are on no wall
-    axis = np.array([fit[1], fit[3], 1.0])
-    return fit[[0, 2]], axis / np.linalg.norm(axis), float(np.median(np.abs(errors(fit))))
 
 
 def _flush(T, points, opening: float, tip: float):

@@ -1,11 +1,13 @@
-"""Necks: how deep flat pads hold a neck from its end, and how far they are opened for it."""
+"""Necks: how deep flat pads hold a neck from its end and how far they are opened for it, and a neck in a cloud."""
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import least_squares
 
 from tdf_jax.sim.pads import TIPS
+from tdf_jax.sim.robot import Fingers
 
 CLEARANCE, LEAST_CLEARANCE = 0.010, 0.005  # metres between each finger and a neck, whose middle the cloud shows well
 DEPTHS = (0.012, 0.052)  # metres from the end of the neck to the tips; the palm is 0.055 m behind them
@@ -17,6 +19,19 @@ EDGE, UNSTEADY, AT_EDGE = 0.005, 0.009, 0.3
 STEEP = 0.4  # radius over length of a slope on which the tips do not hold at all
 NEAR = 0.020  # metres between pads and centre of mass, below which nearer is no better
 RECESS = 0.003  # metres by which the fingers are further apart behind the pads
+# In a cloud, a neck is round about an axis to this, metres, in the median; its radius is linear between levels so far
+# apart. As many points are needed, and a span along the axis, metres.
+ROUND_TO, KNOTS, LEAST, SPREAD = 0.001, 0.004, 16, 0.006
+NOISE = 0.001  # metres; points further from a neck count less
+STEEPEST, FARTHEST = np.radians(20), 0.015  # largest turn onto the axis, radians, and movement to it, metres
+# Metres beyond the tips up to which a neck is sought: descriptors know its axis better than the height on it.
+BEYOND = (0.02, 0.004)
+GAP = 0.008  # metres along a neck without points, beyond which is something else
+FINE, SMOOTH = 0.003, 0.2  # metres between the knots of a neck's radii, and the weight of their bends
+TOUCHED_POINTS = 0.0006  # metres, as TOUCHED, of widths by points
+ALONG, WORTH = 0.04, 0.03  # metres: largest movement along a neck, and the one for which pads must hold e times better
+# Sine of the tilt of a neck from which on the turn about it matters, and turns about the best one, radians.
+TILTED, OFF_PLANE = 0.02, tuple(np.radians([0.0, 5.0, -5.0]))
 
 
 class Hold(NamedTuple):
@@ -72,3 +87,123 @@ def neck_holds(
             score *= AT_EDGE
         holds.append(Hold(float(depth), width, float(inserted.max()) + 2 * clearance, score))
     return holds
+
+
+def neck_grasps(
+    T: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "points 3"], opening: float, fingers: Fingers
+) -> list[tuple[Float[np.ndarray, "4 4"], float]]:
+    """Grasps along the axis of the round neck between the fingers, as deep as pads hold best.
+
+    Args:
+        T: pose of the gripper's frame, 4x4, metres, world frame.
+        points: cloud of the object, (points, 3), metres, world frame.
+        opening: opening of the fingers before they close, metres, such as the demonstrated one.
+        fingers: how the gripper answers to commands.
+
+    Returns:
+        Poses and openings, metres, the best first; several of a tilted neck, turned about it. None if there is no neck.
+    """
+    held = None
+    for _ in range(2):  # again at the depth that was found, where the axis is measured
+        tip = fingers.tip(max(opening - 2 * CLEARANCE, 0.0))
+        found = [_along_neck(T, points, fingers.widest, tip, beyond) for beyond in BEYOND]
+        aligned, misfit = min(found, key=lambda one: one[1])
+        if not np.isfinite(misfit):
+            break
+        deepened = _deepened(aligned, points, tip, fingers)
+        if deepened is None:
+            break
+        T, opening = held = deepened
+    return [] if held is None else [(turned, opening) for turned in _about_neck(T)]
+
+
+def _deepened(T, points, tip: float, fingers: Fingers) -> tuple[np.ndarray, float] | None:
+    """A grasp along the axis of a neck, moved along it to where pads hold best, and the opening there."""
+    x, y, z = ((points - T[:3, 3]) @ T[:3, :3]).T
+    radii = np.hypot(x, y)
+    along = np.sort(z[radii < fingers.widest / 2])
+    ends = np.flatnonzero((np.diff(along) > GAP) & (along[:-1] < tip))
+    end = float(along[ends[-1] + 1 if len(ends) else 0])
+    levels = np.arange(LEVEL_STEP, DEPTHS[1], LEVEL_STEP)
+    widths = 2 * _profile(z - end, radii, levels)
+    holds = neck_holds(levels, widths, float(z.mean()) - end, fingers.widest, TOUCHED_POINTS)
+    moves = [end + one.depth - fingers.tip(one.width) for one in holds]
+    reached = [number for number, move in enumerate(moves) if abs(move) < ALONG]
+    if not reached:
+        return None
+    best = max(reached, key=lambda number: holds[number].score * np.exp(-abs(moves[number]) / WORTH))
+    T = T.copy()
+    T[:3, 3] += moves[best] * T[:3, 2]
+    return T, holds[best].opening
+
+
+def _about_neck(T) -> list[np.ndarray]:
+    """A grasp, turned about its approach to where what it holds swings least, the best first."""
+    along, closing = T[2, 0], T[2, 1]  # the vertical, in the gripper's frame
+    if np.hypot(along, closing) < TILTED:
+        return [T]
+    plane = np.arctan2(-along, closing)  # from the closing direction
+    plane -= np.pi * np.round(plane / np.pi)  # the same gripper, half a turn about
+    grasps = []
+    for angle in plane + np.array(OFF_PLANE):
+        turn, (cos, sin) = np.eye(4), (np.cos(angle), np.sin(angle))
+        turn[:2, :2] = [[cos, -sin], [sin, cos]]
+        grasps.append(T @ turn)
+    return grasps
+
+
+def _profile(heights, radii, levels) -> np.ndarray:
+    """Radii at levels of a round body, linear between knots `FINE` metres apart; points off it count little."""
+    knots = np.arange(0.0, levels[-1] + FINE, FINE)
+    inside = (heights > -FINE) & (heights < knots[-1])
+    heights, radii = heights[inside], radii[inside]
+    rows = np.stack([np.interp(heights, knots, row) for row in np.eye(len(knots))], axis=1)
+    bend = SMOOTH * np.diff(np.eye(len(knots)), n=2, axis=0)
+    weights, fit = np.ones(len(radii)), np.zeros(len(knots))
+    for _ in range(10):
+        rows_of, values = (
+            np.concatenate([weights[:, None] * rows, bend]),
+            np.concatenate([weights * radii, np.zeros(len(bend))]),
+        )
+        fit = np.linalg.lstsq(rows_of, values, rcond=None)[0]
+        weights = np.sqrt(1 / np.maximum(np.abs(radii - rows @ fit), NOISE / 4))
+        weights /= weights.max()
+    return np.interp(levels, knots, fit)
+
+
+def _along_neck(T, points, widest: float, tip: float, beyond: float):
+    """Turn and move a grasp so that its approach is the axis of a round neck, and the misfit; inf if there is none."""
+    last = np.inf
+    for _ in range(2):
+        x, y, z = ((points - T[:3, 3]) @ T[:3, :3]).T
+        inside = (np.hypot(x, y) < widest / 2) & (z > tip - 2 * TIPS) & (z < tip + beyond)
+        x, y, z = x[inside], y[inside], z[inside]
+        if len(y) < LEAST or np.ptp(z) < SPREAD:
+            break
+        centre = float(z.mean())
+        at, axis, misfit = _axis(x, y, z - centre)
+        if misfit > ROUND_TO or axis[2] < np.cos(STEEPEST) or np.hypot(*at) > FARTHEST:
+            break
+        across = np.cross(axis, (1.0, 0.0, 0.0))
+        across /= np.linalg.norm(across)
+        turn = np.eye(4)
+        turn[:3, :3] = np.stack([np.cross(across, axis), across, axis], axis=1)
+        turn[:3, 3] = np.array([*at, centre]) - turn[:3, :3] @ (0.0, 0.0, centre)
+        T, last = T @ turn, misfit
+    return T, last
+
+
+def _axis(x, y, z) -> tuple[np.ndarray, np.ndarray, float]:
+    """Where the axis of a round body is at z = 0, (2,), its direction, (3,), and the median distance of its points."""
+    levels = max(2, int(np.ptp(z) / KNOTS) + 1)
+    knots = np.linspace(z.min(), z.max(), levels)
+    share = np.stack([np.interp(z, knots, row) for row in np.eye(levels)], axis=1)
+
+    def errors(fit):
+        return np.hypot(x - fit[0] - fit[1] * z, y - fit[2] - fit[3] * z) - share @ fit[4:]
+
+    start = np.concatenate([[x.mean(), 0, y.mean(), 0], np.full(levels, np.hypot(x, y).mean())])
+    fit = least_squares(errors, start, loss="soft_l1", f_scale=NOISE).x
+    fit = least_squares(errors, fit, loss="cauchy", f_scale=NOISE / 4).x  # points of the end are on no wall
+    axis = np.array([fit[1], fit[3], 1.0])
+    return fit[[0, 2]], axis / np.linalg.norm(axis), float(np.median(np.abs(errors(fit))))
