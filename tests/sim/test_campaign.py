@@ -101,7 +101,9 @@ def test_every_method_gives_a_path_and_a_motion(robot, tmp_path, method):
     episode, shown = imitator.episode(4)
     assert episode.object_body.mass == 0.01 and shown == 4
     np.testing.assert_array_equal(episode.T_world_target, imitator.shown(4)[0].T_world_target)
-    paths, motion = imitator.found(episode, shown)[:2]
+    found = imitator.found(episode, shown)
+    paths, motion = found.paths, found.motion
+    assert len(found.openings) == len(paths) and (found.openings > 0).all()
     for T in (*paths[0], motion):
         np.testing.assert_allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-4)
     # The gripper moves with the object from the pick to the release.
