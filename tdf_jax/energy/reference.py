@@ -225,8 +225,8 @@ def _contact(demonstrations, fields, model, target_model, combine) -> Contact | 
 
 
 def _target_logits(targets, fields, model: Model, target_model: Model | None) -> Float[np.ndarray, "2"]:
-    """See `Contact`; infinite if the targets are traced."""
-    known = not checks.traced(*jax.tree.leaves([fields, [target.points for target in targets]]))
+    """See `Contact`; infinite if the targets are traced, or what describes them."""
+    known = not checks.in_trace(*jax.tree.leaves([fields, [target.points for target in targets]]))
     if target_model is None or not known or target_model.info != model.info:
         return np.full(2, np.inf)
     logits = [surface_logits(field, target.points) for field, target in zip(fields, targets, strict=True)]

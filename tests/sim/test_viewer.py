@@ -142,7 +142,7 @@ def test_a_kept_episode_runs_again_to_be_shown(windows, clock, tmp_path, monkeyp
     model, data = falling()
     cell, runs = types.SimpleNamespace(model=model), []
 
-    def run_episode(episode, robot, candidates, watch=None, **options):
+    def run_episode(episode, robot, candidates, openings, watch=None, **options):
         runs.append(watch is not None)
         for _ in range(20 if watch else 0):
             mujoco.mj_step(model, data)
@@ -159,7 +159,7 @@ def test_a_kept_episode_runs_again_to_be_shown(windows, clock, tmp_path, monkeyp
     monkeypatch.setattr(campaign, "load_imitator", load)
     episode = types.SimpleNamespace(rejected=0, redrawn=0)
     monkeypatch.setattr(Imitator, "episode", lambda self, number: (episode, 0))
-    found = Found(np.eye(4)[None, None], np.eye(4), "", 1.0)
+    found = Found(np.eye(4)[None, None], np.array([0.05]), np.eye(4), "", 1.0)
     monkeypatch.setattr(Imitator, "found", lambda self, episode, shown: found)
     condition = Condition("bowl_on_shelf", "known", "upright", "execute")
     settings = Settings(condition, "bowl", None, 0, tmp_path)
