@@ -170,6 +170,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         ]
     except (InputError, OSError) as error:
         parser.error(str(error))
+    if not any(np.isfinite(one.residual) for one in picks):
+        parser.error(f"none of the {len(picks)} picks found anything; check --weights and --category")
     print(report(picks, (INTERCEPT, SLOPE)))
     if settings.fit:
         finite = [one for one in picks if np.isfinite(one.residual)]

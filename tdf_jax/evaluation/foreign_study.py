@@ -23,12 +23,12 @@ from scipy.spatial import Delaunay, KDTree
 from tdf_jax._internal.errors import ForeignPointsWarning, SizeWarning
 from tdf_jax._internal.files import replace_file
 from tdf_jax.energy.reference import Reference
+from tdf_jax.evaluation import view_study
 from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, SEED_SPACE, Case, generated_case, size_of
 from tdf_jax.evaluation.pick_transfer import place_errors, place_reference
 from tdf_jax.evaluation.statistics import FINE, SUCCESS
 from tdf_jax.evaluation.tables import markdown
 from tdf_jax.evaluation.tabletop import build_tabletop, moved
-from tdf_jax.evaluation.view_study import MARGIN
 from tdf_jax.geometry.query import box_query
 from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.networks.checkpoint import load_model
@@ -97,10 +97,8 @@ def foreign_case(seed: int, pair: int, row: str) -> Case:
 
 def on_handle(case: Case) -> Bool[np.ndarray, " points"]:
     """Which points of `points_b` are on the mug's handle, (points,)."""
-    p = cast(Mug, case.object_b).parameters
     local = moved(case.points_b.astype(float), np.linalg.inv(case.T_world_b))
-    outside = local[:, 0] > max(p.top_radius, p.bottom_radius) + max(p.bulge, 0.0) + MARGIN
-    return outside & (np.arange(len(local)) < POINTS)
+    return view_study.on_handle(cast(Mug, case.object_b), local) & (np.arange(len(local)) < POINTS)
 
 
 def measure(model: Model, case: Case, row: str, pair: int, query: Float[Array, "queries 3"]) -> list[Pick]:
@@ -216,6 +214,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     settings = parser.parse_args(arguments)
     if settings.pairs < 1 or settings.seed < 0:
         parser.error("--pairs must be at least 1, and --seed at least 0")
+    if settings.out is not None and not settings.out.parent.is_dir():  # said before the work, not after it
+        parser.error(f"--out is {settings.out}; expected a file in an existing folder")
     model = load_model("mug")
     query = box_query(jax.random.key(settings.seed), QUERIES, QUERY_SIZE)
     picks: list[Pick] = []

@@ -16,7 +16,7 @@ from typing import NamedTuple, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from tdf_jax._internal.files import replace_file
@@ -102,10 +102,15 @@ def measure(model: Model, reference: Reference, seed: int, number: int) -> Case 
     return Case(number, before, after, confident_before, confident_after, handle_points(mug, second), turned)
 
 
+def on_handle(mug: Mug, points: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, " points"]:
+    """Which points in a mug's frame are on its handle, outside of its body."""
+    p = mug.parameters
+    return points[:, 0] > max(p.top_radius, p.bottom_radius) + max(p.bulge, 0.0) + MARGIN
+
+
 def handle_points(mug: Mug, points: Float[np.ndarray, "points 3"]) -> int:
     """Number of points on a mug's handle, outside of its body."""
-    p = mug.parameters
-    return int((points[:, 0] > max(p.top_radius, p.bottom_radius) + max(p.bulge, 0.0) + MARGIN).sum())
+    return int(on_handle(mug, points).sum())
 
 
 def picked(
@@ -158,6 +163,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     settings = parser.parse_args(arguments)
     if settings.mugs < 1 or settings.seed < 0:
         parser.error("--mugs must be at least 1, and --seed at least 0")
+    if settings.out is not None and not settings.out.parent.is_dir():  # said before the work, not after it
+        parser.error(f"--out is {settings.out}; expected a file in an existing folder")
     model = load_model("mug")
     reference = demonstrate(model, settings.seed)
     cases: list[Case] = []

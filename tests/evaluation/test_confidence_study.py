@@ -64,6 +64,16 @@ def test_an_interrupted_study_goes_on(monkeypatch, tmp_path, capsys):
     assert "a fit needs 10 of each" in capsys.readouterr().err
 
 
+def test_picks_that_find_nothing_end_in_a_line(monkeypatch, tmp_path, capsys):
+    nothing = Pick("full", np.nan, np.nan, np.nan, np.nan)
+    monkeypatch.setattr(confidence_study, "measure", lambda *about: nothing)
+    monkeypatch.setattr(confidence_study, "load_model", lambda name: name)
+    monkeypatch.setattr(confidence_study, "fingerprint", lambda model: model)
+    with pytest.raises(SystemExit) as ended:
+        main(["--picks", "2", "--out", str(tmp_path)])
+    assert ended.value.code == 2 and "none of the 2 picks found anything" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

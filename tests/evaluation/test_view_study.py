@@ -47,3 +47,7 @@ def test_the_study_prints_rates_and_keeps_the_cases(monkeypatch, tmp_path, capsy
     assert [case["number"] for case in json.loads((tmp_path / "cases.json").read_text())] == [0, 2, 4, 6]
     with pytest.raises(SystemExit):
         view_study.main(["--mugs", "0"])
+    with pytest.raises(SystemExit):  # before anything is measured
+        view_study.main(["--mugs", "4", "--out", str(tmp_path / "missing" / "cases.json")])
+    captured = capsys.readouterr()
+    assert captured.out == "" and "expected a file in an existing folder" in captured.err
