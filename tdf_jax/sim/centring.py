@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from tdf_jax.sim import necks
 from tdf_jax.sim.grasps import CLEARANCE
-from tdf_jax.sim.pads import HALF_PAD, TIPS, flush_turn, turned_about_x
+from tdf_jax.sim.pads import HALF_PAD, TIPS, flush_turn, turned_about_approach, turned_about_x
 from tdf_jax.sim.robot import Fingers
 
 BESIDE = 0.014  # metres, half width of the region between the fingers, along x
@@ -23,8 +23,23 @@ WALL_BESIDE, THICKEST = 0.022, 0.018
 OUTLIERS, NEAR = 2.5, 0.0004
 LEAST_OF_WALL, LEAST_OF_SIDE = 10, 6  # points for a fit, and on both sides for a taper
 GRID = 0.001  # metres between points of the fitted surfaces
-FLUSH = 0.005  # radians; a smaller turn ends the search
+FLUSH, ALONG = 0.005, 0.02  # radians; smaller turns about x and about the approach end the search
+WIDEST_TWIST = np.radians(30)  # about the approach; a wall that is turned further is another surface
 FINGER, CLOSE_BY, FARTHEST = 0.010, 0.001, 0.015  # metres: thickness of a finger, clearance, and largest withdrawal
+
+
+class Wall(NamedTuple):
+    """A wall that is fitted to the points between the fingers.
+
+    Attributes:
+        surfaces: points of both of its surfaces, (points, 3), metres, in the gripper's frame.
+        thickness: its thickness, metres.
+        twist: turn about the approach after which the closing direction is along its normal, radians.
+    """
+
+    surfaces: Float[np.ndarray, "points 3"]
+    thickness: float
+    twist: float
 
 
 class Centred(NamedTuple):
@@ -79,9 +94,9 @@ def _on_wall(T, points, opening: float, fingers: Fingers) -> tuple[np.ndarray, f
     flush = _along_wall(T, points, opening, tip)
     x, y, z = _between(flush, points, WALL_BESIDE, opening, tip)
     if len(y) >= LEAST_OF_WALL:
-        surfaces, thickness = _wall(x, y, z, tip + BEYOND)
-        if thickness <= THICKEST:
-            return flush, min(2 * float(np.abs(surfaces[:, 1]).max()) + 2 * CLEARANCE, fingers.widest)
+        wall = _wall(x, y, z, tip + BEYOND)
+        if wall.thickness <= THICKEST:
+            return flush, min(2 * float(np.abs(wall.surfaces[:, 1]).max()) + 2 * CLEARANCE, fingers.widest)
     _, y, _ = _between(T, points, HALF_PAD, fingers.widest, tip)
     if not len(y) or np.ptp(y) <= THICKEST:
         return flush, opening
@@ -126,26 +141,26 @@ def _between(T, points, beside: float, opening: float, tip: float):
 
 
 def _flush(T, points, opening: float, tip: float):
-    """Turn a grasp to where the wall between the fingers is narrowest, and move it to the middle there."""
-    for _ in range(ROUNDS):
+    """Turn a grasp to where the wall between the fingers is narrowest, along its normal, and to the middle there."""
+    for _ in range(2 * ROUNDS):
         x, y, z = _between(T, points, WALL_BESIDE, opening, tip)
         if len(y) < LEAST_OF_WALL:
             return T
-        surfaces, thickness = _wall(x, y, z, tip + BEYOND)
-        if thickness > THICKEST:  # a neck
+        wall = _wall(x, y, z, tip + BEYOND)
+        if wall.thickness > THICKEST or abs(wall.twist) > WIDEST_TWIST:  # a neck, or another surface
             return T
         pivot = float(z.min() + tip) / 2
-        angle, shift = flush_turn(surfaces, tip, pivot)
+        angle, shift = flush_turn(wall.surfaces, tip, pivot)
         if abs(shift) > LONGEST / 3:  # the wall was in the middle already: the fit is of something else
             return T
-        T = turned_about_x(T, angle, pivot, shift)
-        if abs(angle) < FLUSH:
+        T = turned_about_approach(turned_about_x(T, angle, pivot, shift), wall.twist)
+        if abs(angle) < FLUSH and abs(wall.twist) < ALONG:
             break
     return T
 
 
-def _wall(x, y, z, end: float) -> tuple[np.ndarray, float]:
-    """Points of both surfaces of a wall, as far along the approach as `end`, and its thickness, metres.
+def _wall(x, y, z, end: float) -> Wall:
+    """A wall, as far along the approach as `end`, metres.
 
     The middle y(x, z) is a polynomial of second degree, and half of the thickness one of first degree in z.
     """
@@ -173,7 +188,7 @@ def _wall(x, y, z, end: float) -> tuple[np.ndarray, float]:
     half, taper = (*fit[rows.shape[1] :], 0.0, 0.0)[:2]
     half_there = np.maximum(half + taper * (along - centre), 0.0)
     surfaces = [np.column_stack([across, middle + sign * half_there, along]) for sign in (1, -1)]
-    return np.concatenate(surfaces), 2 * abs(float(half))
+    return Wall(np.concatenate(surfaces), 2 * abs(float(half)), float(np.arctan(fit[1])))
 
 
 def _monomials(x, z) -> np.ndarray:

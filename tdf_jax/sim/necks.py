@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from tdf_jax.sim.pads import TIPS
+from tdf_jax.sim.pads import TIPS, turned_about_approach
 from tdf_jax.sim.robot import Fingers
 
 CLEARANCE, LEAST_CLEARANCE = 0.010, 0.005  # metres between each finger and a neck, whose middle the cloud shows well
@@ -144,12 +144,7 @@ def _about_neck(T) -> list[np.ndarray]:
         return [T]
     plane = np.arctan2(-along, closing)  # from the closing direction
     plane -= np.pi * np.round(plane / np.pi)  # the same gripper, half a turn about
-    grasps = []
-    for angle in plane + np.array(OFF_PLANE):
-        turn, (cos, sin) = np.eye(4), (np.cos(angle), np.sin(angle))
-        turn[:2, :2] = [[cos, -sin], [sin, cos]]
-        grasps.append(T @ turn)
-    return grasps
+    return [turned_about_approach(T, angle) for angle in plane + np.array(OFF_PLANE)]
 
 
 def _profile(heights, radii, levels) -> np.ndarray:

@@ -50,3 +50,15 @@ def turned_about_x(T: Float[np.ndarray, "4 4"], angle: float, pivot: float, shif
     turn[1:3, 1:3] = [[cos, -sin], [sin, cos]]
     turn[:3, 3] = np.array([0.0, 0.0, pivot]) - turn[:3, :3] @ [0.0, -shift, pivot]
     return T @ turn
+
+
+def turned_about_approach(T: Float[np.ndarray, "4 4"], angle: float) -> Float[np.ndarray, "4 4"]:
+    """A gripper's frame, turned about its approach.
+
+    Args:
+        T: pose of the gripper's frame, 4x4, metres.
+        angle: the turn, radians.
+    """
+    turn, (cos, sin) = np.eye(4), (np.cos(angle), np.sin(angle))
+    turn[:2, :2] = [[cos, -sin], [sin, cos]]
+    return T @ turn
