@@ -130,6 +130,11 @@ from tdf_jax.sim.motion import plan_joints as plan_joints
 from tdf_jax.sim.retiming import retime as retime
 from tdf_jax.sim.robot import Robot as Robot, load_robot as load_robot
 from tdf_jax.solvers.adam import OptimizeConfig as OptimizeConfig, optimize as optimize
+from tdf_jax.solvers.imitation_scene import (
+    ImitationScene as ImitationScene,
+    load_imitation as load_imitation,
+    save_imitation as save_imitation,
+)
 from tdf_jax.solvers.multistart import SolveConfig as SolveConfig, solve as solve
 from tdf_jax.solvers.pick import CarryConfig as CarryConfig, carry as carry
 from tdf_jax.solvers.result import Result as Result
@@ -186,6 +191,7 @@ __all__ = [
     "hang_on_rack",
     "imitate",
     "imitate_batch",
+    "ImitationScene",
     "InputError",
     "InvalidPointsWarning",
     "JointTrajectory",
@@ -194,6 +200,7 @@ __all__ = [
     "lift_over",
     "line",
     "load_demonstration",
+    "load_imitation",
     "load_joint_trajectory",
     "load_landscape",
     "load_mesh",
@@ -236,6 +243,7 @@ __all__ = [
     "sample_rack",
     "sample_surface",
     "save_demonstration",
+    "save_imitation",
     "save_landscape",
     "save_model",
     "save_trajectory",

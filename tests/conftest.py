@@ -1,10 +1,15 @@
 """What the tests share: golden outputs of the original network, a small random network, and a count of compilations."""
 
 import atexit
+import base64
 import contextlib
 import dataclasses
 import functools
+import gzip
+import io
+import json
 import os
+import re
 import shutil
 import tempfile
 from pathlib import Path
@@ -250,6 +255,47 @@ def compilations():
     start, names = len(_compiled), []
     yield names
     names += _compiled[start:]
+
+
+# Pages and the viewer in a browser.
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+SOFTWARE = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+
+
+def page_content(page):
+    """What a page of `write_page` draws: data, layout and, if something moves, its frames."""
+    packed = re.search(r'id="content">([^<]+)<', page).group(1)
+    return json.loads(gzip.decompress(base64.b64decode(packed)))
+
+
+def _no_browser(why):
+    if os.environ.get("TDF_BROWSER") == "required":  # by `make test-all`
+        pytest.fail(f"{why}, and TDF_BROWSER=required")
+    pytest.skip(f"NOT TESTED IN A BROWSER: {why}")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Chromium without a window, which draws on the processor."""
+    found = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if found is None:
+        _no_browser(f"none of {', '.join(BROWSERS)} is installed (Debian: apt install chromium)")
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        _no_browser("playwright is not installed (pip install playwright)")
+    with sync_playwright() as driver:
+        chromium = driver.chromium.launch(executable_path=found, args=list(SOFTWARE))
+        yield chromium
+        chromium.close()
+
+
+def colours_of(png):
+    """Number of distinct colours of a screenshot: a blank one has a handful."""
+    from PIL import Image
+
+    return len(np.unique(np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).reshape(-1, 3), axis=0))
 
 
 # The robot in physics, and what its tests share.

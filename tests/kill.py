@@ -101,7 +101,7 @@ COMMANDS = {
     "landscape": Command(
         (
             "landscape", *SCENE, "--half", "0.1", "--pitch", "0.05", "--rotation", "turns", "--rotations", "64",
-            "--no-page", "--out", "out",
+            "--out", "out",
         ),
         tiles,
     ),

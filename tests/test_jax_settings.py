@@ -114,6 +114,7 @@ CALLS = {
     "DescriptorField": lambda w: (w.field.descriptors(w.query), w.field.occupancy(np.asarray(w.query)), w.field.latent),
     "Demonstration": lambda w: dataclasses.astuple(tdf.Demonstration(w.points, w.path, w.query).resampled(3)),
     "Grid": lambda w: tdf.Grid(w.zeros, w.axes, (w.steps, w.steps, w.steps)).points,
+    "ImitationScene": lambda w: tdf.ImitationScene(w.demonstration, w.points, w.result).points,
     "JointTrajectory": lambda w: (lambda moved: (moved.positions, moved.velocities(), moved.at(w.steps)))(
         tdf.JointTrajectory(w.steps, w.axes, ("a", "b", "c"), w.openings)
     ),

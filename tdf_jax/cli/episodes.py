@@ -24,7 +24,7 @@ def measure(out: Path, settings: dict[str, Any]) -> None:
     Raises:
         InputError: an option is wrong, the extra "sim" is not installed, or the folder cannot be written.
     """
-    from tqdm import tqdm
+    from tqdm.auto import tqdm
 
     from tdf_jax._internal import checks
     from tdf_jax._internal.errors import InputError

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import jax
 import numpy as np
 import tyro
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 import tdf_jax
 from tdf_jax._internal import checks
@@ -19,7 +19,7 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file, replace_folder
 from tdf_jax.cli.camera import choose, read_scene, table as cluster_table
 from tdf_jax.cli.options import Settings, make_scene, resolved
-from tdf_jax.cli.pictures import Pictures
+from tdf_jax.cli.pictures import Pictures, check_page
 from tdf_jax.cli.tasks import TaskScene, make_task, not_judged
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import describe
@@ -32,6 +32,7 @@ from tdf_jax.io.trajectories import save_trajectory
 from tdf_jax.networks.checkpoint import load_model
 from tdf_jax.networks.model import Model
 from tdf_jax.solvers.adam import OptimizeConfig
+from tdf_jax.solvers.imitation_scene import SCENE, ImitationScene, save_imitation, weights_of
 from tdf_jax.solvers.multistart import SolveConfig
 from tdf_jax.solvers.pick import CarryConfig
 from tdf_jax.solvers.result import Result
@@ -41,14 +42,15 @@ from tdf_jax.uncertainty.modes import cluster_poses
 # drawn from that one would be the answer.
 STREAM = 0x1D317A7E
 SCHEMA = 3  # raised when a field of result.json changes its meaning or goes
-RESULT = "result.json"
-NAMES = (RESULT, "trajectory.npz", "trajectory.tum", "imitation.png", "loss.png")
+RESULT, PAGE = "result.json", "imitation.html"
+NAMES = (RESULT, SCENE, "trajectory.npz", "trajectory.tum", "imitation.png", "loss.png", PAGE)
 
 
 def imitate(settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()) -> None:
     """Imitate a demonstrated trajectory on a new object; by default on a generated mug in a random pose.
 
-    Writes a folder with result.json, trajectory.npz, trajectory.tum, imitation.png and loss.png.
+    Writes a folder with result.json, trajectory.npz, trajectory.tum, scene.npz, imitation.png and loss.png; with
+    --page also imitation.html.
     """
     settings = resolved(settings)
     pictures = Pictures("tdf imitate")
@@ -64,6 +66,8 @@ def _run(settings: Settings, folder: Path, pictures: Pictures) -> dict:
     """Imitate, write the folder and return the record."""
     seconds = {}
     began = time.perf_counter()
+    if settings.page:
+        check_page("tdf imitate")
     query_key, start_key = jax.random.split(jax.random.fold_in(jax.random.key(settings.seed), STREAM))
     with _timed(seconds, "load"):
         config = _config(settings)
@@ -110,10 +114,28 @@ def _run(settings: Settings, folder: Path, pictures: Pictures) -> dict:
     relation = _relation(scene, task, result)
     save_trajectory(folder / "trajectory.npz", trajectory)
     save_trajectory(folder / "trajectory.tum", trajectory)
+    found, expected = _errors(scene, trajectory)
+    shown = ImitationScene(
+        scene.demonstration,
+        scene.points,
+        result,
+        target_points,
+        expected,
+        scene.meshes,
+        weights_of(str(settings.weights), model),
+        None if target_model is None else weights_of(str(settings.target_weights or settings.weights), target_model),
+    )
+    save_imitation(folder / SCENE, shown)
+    title = _title(float(result.loss), found, relation)
     if not settings.no_plots:
         with _timed(seconds, "plots"):
             rows = "start" if isinstance(config, OptimizeConfig) else "candidate"
-            _draw(folder, scene, target_points, result, rows, relation, pictures)
+            _draw(folder, shown, title, rows, pictures)
+    if settings.page:
+        with _timed(seconds, "page"), pictures.drawing(folder / PAGE) as path:
+            from tdf_jax.viz.imitation_page import save_imitation_page
+
+            save_imitation_page(path, shown, title)
     seconds["total"] = time.perf_counter() - began
     record = _record(settings, model, scene, energy, config, result, relation, camera, seconds)
     replace_file("tdf imitate", folder / RESULT, json.dumps(record, indent=1).encode())
@@ -149,37 +171,29 @@ def _config(settings: Settings) -> CarryConfig | SolveConfig | OptimizeConfig:
     return CarryConfig(**starts)
 
 
-def _draw(
-    folder: Path,
-    scene: Scene,
-    target_points: np.ndarray | None,
-    result: Result,
-    rows: str,
-    relation: dict | None,
-    pictures: Pictures,
-) -> None:
+def _draw(folder: Path, scene: ImitationScene, title: str, rows: str, pictures: Pictures) -> None:
+    related = scene.demonstration.target is not None
     with pictures.drawing(folder / "imitation.png") as path:
         from tdf_jax.viz.imitation import imitation_figure
         from tdf_jax.viz.relations import relation_figure
         from tdf_jax.viz.style import save_figure
 
-        found, expected = _errors(scene, result.trajectory)
-        title = _title(float(result.loss), found, relation)
-        if relation is None:
-            figure = imitation_figure(
-                scene.demonstration, scene.points, result.trajectory, expected, scene.meshes, title
-            )
+        result = scene.result
+        if related:
+            figure = relation_figure(scene.demonstration, scene.points, result, scene.target_points, title=title)
         else:
-            figure = relation_figure(scene.demonstration, scene.points, result, target_points, title=title)
+            figure = imitation_figure(
+                scene.demonstration, scene.points, result.trajectory, scene.expected, scene.meshes, title
+            )
         save_figure(path, figure)
     with pictures.drawing(folder / "loss.png") as path:
         from tdf_jax.viz.imitation import loss_figure
         from tdf_jax.viz.style import save_figure
 
-        history = np.asarray(result.candidate_history)
-        if relation is None:  # with a target, the last energies are sums with those of the contact regions
-            history = np.column_stack([history, result.energies])
-        save_figure(path, loss_figure(history, int(result.best), rows=rows))
+        history = np.asarray(scene.result.candidate_history)
+        if not related:  # with a target, the last energies are sums with those of the contact regions
+            history = np.column_stack([history, scene.result.energies])
+        save_figure(path, loss_figure(history, int(scene.result.best), rows=rows))
 
 
 @contextlib.contextmanager

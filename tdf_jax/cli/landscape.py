@@ -13,13 +13,13 @@ from typing import Annotated, cast
 import jax
 import numpy as np
 import tyro
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from tdf_jax._internal.cache import digest
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file, replace_folder
 from tdf_jax.cli.options import LandscapeSettings, make_scene, resolved
-from tdf_jax.cli.pictures import Pictures
+from tdf_jax.cli.pictures import Pictures, check_page
 from tdf_jax.energy.reference import Reference, describe
 from tdf_jax.evaluation.scene import Scene
 from tdf_jax.geometry import se3
@@ -37,7 +37,7 @@ from tdf_jax.solvers.initial import default_goal
 
 RESULT = "result.json"
 NAMES = (RESULT, "landscape.npz", "map.png", "isosurface.png", "slices.gif", "landscape.html")
-SCHEMA = 2  # raised when a key of result.json changes its name or its meaning
+SCHEMA = 3  # raised when a key of result.json changes its name or its meaning
 STREAM = 0x1A2D5CA9  # number that is folded into the seed's key
 SAVE_SECONDS = 20.0  # interval between saves of an unfinished sweep
 NUMBER = 4  # bytes of a float32 number
@@ -48,8 +48,8 @@ MAX_PATH_POINTS = 1_000_000  # grid points for the lowest-cost path, which needs
 def landscape(settings: Annotated[LandscapeSettings, tyro.conf.arg(name="")] = LandscapeSettings()) -> None:
     """Sweep the query frame over a grid, and compare its descriptors with those of every waypoint.
 
-    Writes a folder with result.json, landscape.npz, pictures and an interactive page. A sweep that is interrupted is
-    kept beside the folder, and the same command continues it.
+    Writes a folder with result.json, landscape.npz and pictures; with --page also landscape.html. A sweep that is
+    interrupted is kept beside the folder, and the same command continues it.
     """
     settings = resolved(settings)
     began = time.perf_counter()
@@ -79,8 +79,7 @@ def landscape(settings: Annotated[LandscapeSettings, tyro.conf.arg(name="")] = L
             ends = _ends(grid, waypoints[0] if expected is None else expected[0], np.asarray(goal[4:]))
             path = lowest_cost_path(found, *ends, settings.sharpness)
         change = None if settings.query == "given" else query_change(field, given, reference, grid, rotations[0])
-        if not settings.no_plots:
-            _draw(settings, folder, scene, found, expected, path, pictures)
+        _draw(settings, folder, scene, found, expected, path, pictures)
         seconds["total"] = time.perf_counter() - began
         record = _record(settings, found, reference, change, waypoints, expected, path, seconds)
         save_landscape(folder / "landscape.npz", found, {"settings": record["settings"]})
@@ -131,16 +130,10 @@ def _check_size(settings, waypoints, count) -> None:
 
 def _check_extras(settings) -> None:
     """Refuse at once a picture whose extra is not installed."""
-    if settings.no_plots:
-        return
-    if settings.grid not in PLANES:
+    if settings.grid not in PLANES and not (settings.no_plots and not settings.page):
         libigl("tdf landscape")
-    if not settings.no_page:
-        try:
-            from tdf_jax.viz.html import pages
-        except Exception:  # matplotlib is broken, which is no reason not to sweep: all pictures will be missing
-            return
-        pages("tdf landscape")
+    if settings.page:
+        check_page("tdf landscape")
 
 
 def _query(settings, query):
@@ -218,17 +211,18 @@ def _draw(settings, folder: Path, scene: Scene, found: Landscape, expected, path
 
         return Marks(np.asarray(scene.points), scene.meshes[1], expected, path)
 
-    with pictures.drawing(folder / ("map.png" if flat else "isosurface.png")) as file:
-        from tdf_jax.viz.landscapes import isosurface_figure, map_figure
-        from tdf_jax.viz.style import save_figure
+    if not settings.no_plots:
+        with pictures.drawing(folder / ("map.png" if flat else "isosurface.png")) as file:
+            from tdf_jax.viz.landscapes import isosurface_figure, map_figure
+            from tdf_jax.viz.style import save_figure
 
-        save_figure(file, (map_figure if flat else isosurface_figure)(found, marks()))
-    if not flat:
+            save_figure(file, (map_figure if flat else isosurface_figure)(found, marks()))
+    if not settings.no_plots and not flat:
         with pictures.drawing(folder / "slices.gif") as file:
             from tdf_jax.viz.landscapes import save_slices
 
             save_slices(file, found, marks())
-    if not settings.no_page:
+    if settings.page:
         with pictures.drawing(folder / "landscape.html") as file:
             from tdf_jax.viz.html import save_page
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 
 import jax
 import tyro
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from tdf_jax._internal.boundary import own_settings
 from tdf_jax._internal.compiled import kept_compiled
@@ -55,6 +55,9 @@ DEPRECATED_CHOICES = {
     "landscape": {"--reduce": DEPRECATED_REDUCTIONS},
     "reproduce": {"--field-energy": DEPRECATED_FIELD_ENERGIES},
 }
+# Switches of the release before that do nothing any more, by command, and what to know; they are accepted for one
+# release, with a warning.
+DEPRECATED_SWITCHES = {"landscape": {"--no-page": "a page is written with --page alone"}}
 # Signals that ask a command to stop, and what it says then.
 SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 if hasattr(signal, "SIGHUP"):
@@ -170,9 +173,13 @@ def _current(arguments: Sequence[str]) -> list[str]:
     """The arguments with today's names of options and choices."""
     new_names = DEPRECATED_FLAGS.get(arguments[0], {}) if arguments else {}
     new_choices = DEPRECATED_CHOICES.get(arguments[0], {}) if arguments else {}
+    switches = DEPRECATED_SWITCHES.get(arguments[0], {}) if arguments else {}
     current, option = [], ""
     for word in arguments:
         name, equals, value = word.partition("=")
+        if word in switches:
+            print(f"tdf: warning: {word} is deprecated and does nothing: {switches[word]}", file=sys.stderr)
+            continue
         if name in new_names:
             print(f"tdf: warning: {name} is deprecated; use {new_names[name]}", file=sys.stderr)
             name = new_names[name]

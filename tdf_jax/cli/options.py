@@ -108,6 +108,7 @@ class Settings(SceneSettings):
         iterations: number of Adam's steps.
         out: folder of the results; an earlier result there is replaced.
         no_plots: write no imitation.png and loss.png.
+        page: write imitation.html, to turn and play in a browser without a network; needs the extra "pages".
         json: print result.json instead of the table.
     """
 
@@ -132,6 +133,7 @@ class Settings(SceneSettings):
     iterations: Annotated[int | None, _option("INT", "100")] = None
     out: Annotated[Path, _option("DIR")] = Path("imitation")
     no_plots: bool = False
+    page: bool = False
     json: bool = False
 
     COMMAND: ClassVar[str] = "tdf imitate"
@@ -158,9 +160,9 @@ class LandscapeSettings(SceneSettings):
         reduce: how the waypoints' energies are combined: the minimum, a soft minimum, each in its ring about the pick,
             or the mean.
         sharpness: exponent of the energy in the cost of the lowest-cost path from the pick to the goal.
-        no_page: write no landscape.html.
         out: folder of the results; an earlier result there is replaced.
-        no_plots: write no pictures and no page.
+        no_plots: write no pictures.
+        page: write landscape.html, to turn in a browser without a network; needs the extra "pages".
         json: print result.json instead of the table.
     """
 
@@ -177,9 +179,9 @@ class LandscapeSettings(SceneSettings):
     axis: Annotated[tuple[float, float, float], _option("X Y Z")] = (0.0, 0.0, 1.0)
     reduce: Literal["min", "softmin", "assigned", "mean"] = "min"
     sharpness: float = 1.0
-    no_page: bool = False
     out: Annotated[Path, _option("DIR")] = Path("landscape")
     no_plots: bool = False
+    page: bool = False
     json: bool = False
 
     COMMAND: ClassVar[str] = "tdf landscape"

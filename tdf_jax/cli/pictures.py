@@ -49,3 +49,18 @@ class Pictures:
         """
         if self._missing:
             raise PictureError(f"{self._command}: {'; '.join(self._missing)}. All other results are complete")
+
+
+def check_page(function: str) -> None:
+    """Refuse --page at once where the extra that draws it is not installed.
+
+    Args:
+        function: name that the message begins with.
+
+    Raises:
+        InputError: plotly is not installed.
+    """
+    with contextlib.suppress(ImportError):  # matplotlib is broken, which is no reason not to compute: see `Pictures`
+        from tdf_jax.viz.page import pages
+
+        pages(function)

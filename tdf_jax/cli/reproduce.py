@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal, TypeVar, get_args
 
 import tyro
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Float
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from tdf_jax._internal.cache import kept
 from tdf_jax._internal.errors import InputError, TdfWarning

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from tdf_jax._internal.cache import kept
 from tdf_jax.energy.reference import COMBINATIONS, Reference, describe

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from tdf_jax._internal.cache import kept
 from tdf_jax._internal.errors import InputError

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.errors import CategoryWarning, ConfidenceWarning, ForeignPointsWarning, InputError

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from tdf_jax._internal import checks, workers
 from tdf_jax._internal.cache import digest

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from tdf_jax._internal.cache import digest
 from tdf_jax._internal.errors import InputError

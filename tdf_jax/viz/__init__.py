@@ -5,9 +5,12 @@ Importing this package imports matplotlib and, for that moment, hides MPLBACKEND
 Modules:
     contact_sheet: many objects side by side
     evaluation: pictures of the benchmark
-    html: pages that open in a browser
+    html: page of an energy landscape
     imitation: an imitation and its losses
+    imitation_page: page of an imitation, which plays
     landscapes: energy landscapes
+    motion: frames between the poses of a trajectory
+    page: the file of a page, which opens without a network
     paper: the paper's figures
     placements: placed objects, cut open
     polygons3d: solids in 3-D axes

@@ -1,15 +1,11 @@
-"""Interactive pages for a browser."""
+"""The interactive page of an energy landscape."""
 
-import io
 import os
-from pathlib import Path
 from typing import Any
 
 import matplotlib.colors
 import numpy as np
 
-from tdf_jax._internal.errors import InputError
-from tdf_jax._internal.files import replace_file
 from tdf_jax.landscape.storage import Landscape
 from tdf_jax.viz import polygons3d
 from tdf_jax.viz.landscapes import (
@@ -23,6 +19,7 @@ from tdf_jax.viz.landscapes import (
     isosurface,
     path_lines,
 )
+from tdf_jax.viz.page import camera, pages, write_page
 from tdf_jax.viz.style import CENTIMETRES, CLOUD
 
 
@@ -39,7 +36,7 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
 
     Raises:
         InputError: the grid has one axis, the landscape keeps every rotation, plotly (or, for a volume, libigl) is not
-            installed, or the file cannot be written.
+            installed, the page would be too large to pass on, or the file cannot be written.
     """
     plotly = pages("save_page()")
     grid = landscape.grid
@@ -86,28 +83,6 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
         drawn.append(plotly.Scatter3d(x=x, y=y, z=z, mode=mode, name=style["label"], **look))
     figure = plotly.Figure(drawn)
     ends = {f"{axis}axis": {"title": f"{axis} (cm)"} for axis in "xyz"}
-    azimuth, height = np.radians(ANGLES["azim"]), np.radians(ANGLES["elev"])
-    eye = 2.6 * np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
-    scene = ends | {"aspectmode": "data", "camera": {"eye": dict(zip("xyz", eye.tolist()))}}
-    figure.update_layout(title=title, scene=scene, legend={"x": 0, "y": 1}, margin={"l": 0, "r": 0, "b": 0, "t": 40})
-    page = io.StringIO()
-    figure.write_html(page, include_plotlyjs=True, full_html=True, default_height="95vh")
-    replace_file("save_page()", Path(path), page.getvalue().encode())
-
-
-def pages(function: str):
-    """The plotly module that draws pages.
-
-    Args:
-        function: name that the error message begins with.
-
-    Raises:
-        InputError: it is not installed.
-    """
-    try:
-        import plotly.graph_objects
-    except ImportError:
-        raise InputError(
-            f"{function}: plotly is not installed; expected it for pages: pip install 'tdf_jax[pages]'"
-        ) from None
-    return plotly.graph_objects
+    scene = ends | {"aspectmode": "data", "camera": camera(ANGLES, 2.6)}
+    figure.update_layout(scene=scene, legend={"x": 0, "y": 1}, margin={"l": 0, "r": 0, "b": 0, "t": 0})
+    write_page("save_page()", path, figure, title)

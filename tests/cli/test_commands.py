@@ -25,7 +25,7 @@ from tdf_jax.shapes import build_mug
 
 QUICK = ("--method", "adam", "--num-starts", STARTS, "--iterations", 3, "--points", 60)
 TINY = (*QUICK, "--num-poses", POSES, "--queries", QUERIES)
-FILES = {"result.json", "trajectory.npz", "trajectory.tum", "imitation.png", "loss.png"}
+FILES = {"result.json", "scene.npz", "trajectory.npz", "trajectory.tum", "imitation.png", "loss.png"}
 
 
 def run(*words):
@@ -136,7 +136,7 @@ def test_the_record_tells_all_settings(folder, weights):
         "trajectory": "wave",
         "goal_offset": [0.0, 0.0, 0.0], "k": None, "method": "adam", "num_starts": 3, "num_poses": 4, "queries": 8,
         "iterations": 3, "points": 60,
-        "seed": 0, "weights": str(weights), "out": str(folder), "no_plots": False, "json": False,
+        "seed": 0, "weights": str(weights), "out": str(folder), "no_plots": False, "page": False, "json": False,
         "depth": None, "intrinsics": None, "camera_pose": None, "mask": None, "workspace": None, "depth_scale": None,
         "clusters": False, "clean": True,
     }  # fmt: skip

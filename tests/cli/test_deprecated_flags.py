@@ -58,3 +58,10 @@ def test_the_old_energy_of_a_field_stands_for_the_new_one_with_a_warning(capsys)
     )
     words = ["reproduce", "fig2", "--field-energy=mean"]
     assert command_line._current(words) == words and capsys.readouterr().err == ""
+
+
+def test_a_switch_that_does_nothing_any_more_is_dropped_with_a_warning(capsys):
+    assert command_line._current(["landscape", "--no-page", "--json"]) == ["landscape", "--json"]
+    error = capsys.readouterr().err
+    assert error == "tdf: warning: --no-page is deprecated and does nothing: a page is written with --page alone\n"
+    assert command_line._current(["imitate", "--no-page"]) == ["imitate", "--no-page"]

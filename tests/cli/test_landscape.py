@@ -40,7 +40,7 @@ def sweep(weights, tmp_path):
     [("yz", {"map.png"}), ("volume", {"isosurface.png", "slices.gif"}), ("path", {"isosurface.png", "slices.gif"})],
 )
 def test_a_run_writes_every_file_and_nothing_beside_them(weights, tmp_path, grid, pictures):
-    run("landscape", "--weights", weights, "--out", tmp_path / "out", "--grid", grid, *QUICK)
+    run("landscape", "--weights", weights, "--out", tmp_path / "out", "--grid", grid, "--page", *QUICK)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "result.json",
         "landscape.npz",
@@ -60,9 +60,9 @@ def test_pictures_that_fail_leave_the_results(weights, tmp_path, monkeypatch, ca
 
     pictures = {"yz": {"map.png"}, "volume": {"isosurface.png", "slices.gif"}}[grid] | {"landscape.html"}
     monkeypatch.setattr("tdf_jax.viz.landscapes.Marks", broken)
-    monkeypatch.setattr("tdf_jax.viz.html.pages", lambda _: None)  # also where plotly is not installed
+    monkeypatch.setattr("tdf_jax.viz.page.pages", lambda _: None)  # also where plotly is not installed
     with pytest.raises(SystemExit) as stop:
-        run("landscape", "--weights", weights, "--out", tmp_path / "out", "--grid", grid, *QUICK)
+        run("landscape", "--weights", weights, "--out", tmp_path / "out", "--grid", grid, "--page", *QUICK)
     assert stop.value.code == 1
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", "landscape.npz"}
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
@@ -211,7 +211,7 @@ def test_missing_extras_are_named_before_any_work(weights, tmp_path, monkeypatch
         with monkeypatch.context() as patch:
             patch.setitem(sys.modules, module, None)
             with pytest.raises(SystemExit) as stop:
-                run("landscape", "--weights", weights, "--out", tmp_path / "out", "--grid", "volume", *QUICK)
+                run("landscape", "--weights", weights, "--out", tmp_path / "out", "--grid", "volume", "--page", *QUICK)
         assert stop.value.code == 2
         assert words in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
