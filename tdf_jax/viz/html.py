@@ -19,8 +19,8 @@ from tdf_jax.viz.landscapes import (
     isosurface,
     path_lines,
 )
-from tdf_jax.viz.page import camera, pages, write_page
-from tdf_jax.viz.style import CENTIMETRES, CLOUD
+from tdf_jax.viz.page import camera, pages, scene_axes, write_page
+from tdf_jax.viz.style import CENTIMETRES, CLOUD, INK
 
 
 def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title: str = "") -> None:
@@ -82,7 +82,12 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
         look = {"line": {"color": style["color"], "width": 5}, "marker": {"size": 3, "color": style["color"]}}
         drawn.append(plotly.Scatter3d(x=x, y=y, z=z, mode=mode, name=style["label"], **look))
     figure = plotly.Figure(drawn)
-    ends = {f"{axis}axis": {"title": f"{axis} (cm)"} for axis in "xyz"}
-    scene = ends | {"aspectmode": "data", "camera": camera(ANGLES, 2.6)}
-    figure.update_layout(scene=scene, legend={"x": 0, "y": 1}, margin={"l": 0, "r": 0, "b": 0, "t": 0})
+    content = marks.points if marks.mesh is None else marks.mesh.vertices
+    lines = [CENTIMETRES * line for line, _ in path_lines(landscape, marks, CLOUD)]
+    shown = np.concatenate([points.reshape(-1, 3), CENTIMETRES * np.asarray(content), *lines])
+    margin = 0.03 * np.ptp(shown, axis=0)  # plotly cuts what lies on the end of an axis
+    scene = scene_axes(shown.min(axis=0) - margin, shown.max(axis=0) + margin) | {"camera": camera(ANGLES, 2.2)}
+    legend = {"x": 0, "y": 1, "bgcolor": "rgba(255,255,255,0.6)"}
+    font = {"color": INK, "size": 13}
+    figure.update_layout(scene=scene, legend=legend, font=font, margin={"l": 0, "r": 0, "b": 0, "t": 0})
     write_page("save_page()", path, figure, title)

@@ -13,7 +13,7 @@ from tdf_jax.solvers.imitation_scene import ImitationScene
 from tdf_jax.uncertainty.modes import Mode, cluster_poses
 from tdf_jax.viz import polygons3d
 from tdf_jax.viz.motion import Motion, motion_of
-from tdf_jax.viz.page import camera, listed, pages, write_page
+from tdf_jax.viz.page import camera, listed, pages, scene_axes, write_page
 from tdf_jax.viz.scene3d import MOST_TRIANGLES, SHOWN_POINTS, VIEW, bounds
 from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, TRUTH
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 RATE = 12  # frames a second
 MARGIN = 1.06  # length of the axes, in that of their contents
-DISTANCE = 2.1  # of the camera, in the size of the scene
+DISTANCE = 2.25  # of the camera, in the size of the scene
 PICK, OTHERS = 0.35, (0.6, 0.95)  # places in the colour map: the pick, and the other distinct picks by rising energy
 SHOWN_MODES = 4  # distinct picks besides the best
 
@@ -83,14 +83,17 @@ def save_imitation_page(path: str | os.PathLike, scene: ImitationScene, title: s
         "moving": moving,
     }
     figure = plotly.Figure(drawn)
-    # Ranges of all frames at one scale: otherwise the axes would move while it plays.
-    contents = [panel.content(box) for panel in panels.values()]
-    size = MARGIN * np.max([np.ptp(content, axis=0) for content in contents], axis=0)
-    layout: dict[str, Any] = {
-        name: _scene_axes(content, size)
-        | {"camera": camera(VIEW, DISTANCE), "domain": {"x": [0.5 * column, 0.5 * column + 0.49]}}
-        for column, (name, content) in enumerate(zip(panels, contents))
-    }
+    # Ranges of all frames: otherwise the axes would move while it plays. Both sides have one scale, but for ways of a
+    # metre to a target, of which each is drawn as large as possible.
+    contents = [CENTIMETRES * panel.content(box) for panel in panels.values()]
+    sizes = [MARGIN * np.ptp(content, axis=0) for content in contents]
+    if demonstration.target is None:
+        sizes = [np.max(sizes, axis=0)] * 2
+    layout: dict[str, Any] = {}
+    for column, (name, content, size) in enumerate(zip(panels, contents, sizes)):
+        middle = (content.min(axis=0) + content.max(axis=0)) / 2
+        place = {"camera": camera(VIEW, DISTANCE), "domain": {"x": [0.5 * column, 0.5 * column + 0.49]}}
+        layout[name] = scene_axes(middle - size / 2, middle + size / 2) | place
     titles = [
         {"text": text, "x": 0.245 + 0.5 * column, "y": 1.0, "xref": "paper", "yref": "paper", "showarrow": False}
         for column, text in enumerate(("demonstration", "imitation"))
@@ -138,14 +141,6 @@ class _Panel:
         boxes = np.einsum("fij,nj->fni", motion.rotations, box) + motion.translations[:, None]
         parts = [objects.reshape(-1, 3), boxes.reshape(-1, 3), self.path[:, 4:]]
         return np.concatenate(parts if self.target is None else [*parts, self.target])
-
-
-def _scene_axes(content: np.ndarray, size: np.ndarray) -> dict[str, Any]:
-    middle = (content.min(axis=0) + content.max(axis=0)) / 2
-    look = {"backgroundcolor": "#f7f7f7", "gridcolor": "#dedede", "showbackground": True, "nticks": 6}
-    ends = CENTIMETRES * np.stack([middle - size / 2, middle + size / 2], axis=1)
-    axes = {f"{axis}axis": look | {"title": f"{axis} (cm)", "range": listed(pair)} for axis, pair in zip("xyz", ends)}
-    return axes | {"aspectmode": "data"}
 
 
 def _target_points(scene: ImitationScene) -> np.ndarray | None:

@@ -15,6 +15,7 @@ from tdf_jax._internal.files import replace_file
 from tdf_jax.viz.style import INK
 
 LARGEST = 5_000_000  # bytes of a page: mail and issue trackers take it
+DIAGONAL = 1.9  # of a scene, in plotly's unit
 TIMELINE = """
 <div id="timeline"><button id="play">Play</button>
 <input id="time" type="range" min="0" max="%d" value="0" aria-label="time"><span id="pose"></span></div>
@@ -185,6 +186,22 @@ def camera(angles: dict[str, float], distance: float) -> dict:
     azimuth, height = np.radians(angles["azim"]), np.radians(angles["elev"])
     eye = distance * np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
     return {"eye": dict(zip("xyz", eye.tolist())), "center": {"x": 0, "y": 0, "z": -0.1}}
+
+
+def scene_axes(low: np.ndarray, high: np.ndarray) -> dict[str, Any]:
+    """Axes of a scene of plotly at one scale, so that every scene fills its place alike.
+
+    Args:
+        low: least coordinates of what is shown, (3,), centimetres.
+        high: largest coordinates.
+    """
+    look = {"backgroundcolor": "#f7f7f7", "gridcolor": "#dedede", "showbackground": True, "nticks": 6}
+    axes = {
+        f"{axis}axis": look | {"title": f"{axis} (cm)", "range": listed(np.array([least, most]))}
+        for axis, least, most in zip("xyz", low, high)
+    }
+    ratio = DIAGONAL * (high - low) / np.linalg.norm(high - low)
+    return axes | {"aspectmode": "manual", "aspectratio": dict(zip("xyz", listed(ratio)))}
 
 
 def listed(values: np.ndarray, digits: int = 3) -> list:
