@@ -158,17 +158,17 @@ def matmul_gflops(workers: Workers, state: dict, repetitions: int = 8) -> dict[s
 
 
 def ratios(competitors: dict[str, dict], of: str = "median") -> dict[str, float]:
-    """Ratios of the times of every peer and each of ours, by names such as "torch / tdf_jax".
+    """Ratios of the times of every peer and each of ours, by names such as "torch / tdf_jax"; without a peer, of ours.
 
     Args:
         competitors: results by competitor.
         of: "median", or "least", which depends less on other processes.
     """
+    ours = [name for name in OURS if name in competitors]
+    pairs = [(peer, our) for our in ours for peer in PEERS if peer in competitors]
+    pairs = pairs or [(other, ours[0]) for other in ours[1:]]
     return {
-        f"{peer} / {our}": competitors[peer]["seconds"][of] / competitors[our]["seconds"][of]
-        for our in OURS
-        for peer in PEERS
-        if our in competitors and peer in competitors
+        f"{peer} / {our}": competitors[peer]["seconds"][of] / competitors[our]["seconds"][of] for peer, our in pairs
     }
 
 

@@ -116,6 +116,25 @@ def solving(model, settings, arrays):
     return call
 
 
+def picking(model, settings, arrays):
+    """`tdf.track` from a pick before a motion, or `tdf.carry` after it; the whole call, without the encoding."""
+    field, reference, _ = _problem(model, arrays)
+    first = tdf.carry(field, reference, jax.random.key(0))
+    moved = tdf.encode(model, jnp.asarray(arrays["moved"]))
+
+    def call():
+        began = time.perf_counter()
+        if settings["track"]:
+            result = tdf.track(moved, reference, first)
+        else:
+            result = tdf.carry(moved, reference, jax.random.key(1))
+        jax.block_until_ready(result)
+        seconds = time.perf_counter() - began
+        return {"pick": result.pick, "energy": result.loss, "seconds": seconds}
+
+    return call
+
+
 def landscape(model, settings, arrays):
     """`tdf.energy_landscape`, one energy for each rotation."""
     field, reference, _ = _problem(model, arrays)
@@ -168,7 +187,7 @@ def matmul(model, settings, arrays):
     return lambda: {"corner": jax.block_until_ready(program(a, b))[0, 0]}
 
 
-TASKS = {task.__name__: task for task in (encode, gradient, descent, solving, landscape, train, matmul)}
+TASKS = {task.__name__: task for task in (encode, gradient, descent, solving, picking, landscape, train, matmul)}
 
 
 def _problem(model, arrays):

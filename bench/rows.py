@@ -16,6 +16,7 @@ NDF_RATES = {"rotation_rate": 0.01, "translation_rate": 0.01, "final_rate": 1.0}
 POINT_BYTES = {"torch": 95e3, "torch_tuned": 120e3}
 MEMORY_SHARE = 0.8  # usable share of the available memory
 LATENTS, LOSSES, VALUES = 1e-4, 1e-3, 1e-4  # Adam's first steps depend on signs, which rounding changes
+SAME = 1e-3, 1.0  # metres and degrees within which two picks are one
 PROBED = 3  # steps from which the 100 of PyTorch as users run it are estimated: all of them would take minutes
 
 
@@ -35,11 +36,13 @@ class Sizes:
     lattice: tuple[int, int, int] = (6, 6, 7)
     pitch: float = 0.012  # metres
     batch: tuple[int, int, int] = (8, 256, 1024)  # clouds, points, queries
+    track_queries: int = 128
 
 
 QUICK = Sizes(
     clouds=(60,), num_starts=(2,), poses=3, queries=16, target_starts=2, iterations=4, our_iterations=60,
     grid=3, rotations=2, lattice=(2, 2, 3), batch=(2, 40, 32),
+    track_queries=16,
 )  # fmt: skip
 
 
@@ -47,7 +50,8 @@ def rows(sizes: Sizes) -> list[Row]:
     """All rows."""
     found = [encoding(points) for points in sizes.clouds]
     found += [step(num_starts, sizes.poses, sizes.queries) for num_starts in sizes.num_starts]
-    return [*found, target(sizes), target(sizes, same_rates=True), sweeping(sizes), training(sizes)]
+    found += [target(sizes), target(sizes, same_rates=True), sweeping(sizes), training(sizes)]
+    return [*found, tracking(sizes)]
 
 
 def select(found: list[Row], names: list[str] | None) -> list[Row]:
@@ -219,6 +223,27 @@ def sweeping(sizes: Sizes) -> Row:
     title = f"landscape, {about['points']} points x {about['rotations']} rotations x {about['queries']} queries x "
     title += f"{about['poses']} waypoints"
     return Row("landscape", title, about, arrays, plans, values, work)
+
+
+def tracking(sizes: Sizes) -> Row:
+    """The pick on an object that moved: by `tdf.track` from the last one, and anew by `tdf.carry`; after encoding."""
+
+    def arrays():
+        return scene.motion(sizes.poses, sizes.track_queries)
+
+    plans = {"tdf_jax": Plan("picking", {"track": True}), "tdf_jax_solve": Plan("picking", {"track": False})}
+
+    def same(results):
+        picks = [np.asarray(result["pick"]) for result in results.values()]
+        distances = [float(np.linalg.norm(pick[4:] - picks[0][4:])) for pick in picks]
+        cosines = [min(1.0, abs(float(pick[:4] @ picks[0][:4]))) for pick in picks]
+        angle = 2 * float(np.degrees(np.arccos(min(cosines))))
+        found = [check("metres between the picks", max(distances), SAME[0]), check("degrees", angle, SAME[1])]
+        return found, {"energies": {name: float(result["energy"]) for name, result in results.items()}}
+
+    about = {"poses": sizes.poses, "queries": sizes.track_queries}
+    title = f"pick on a moved object, tracked and anew by carry, {sizes.poses} x {sizes.track_queries}"
+    return Row("track", title, about, arrays, plans, same, 0.0)
 
 
 def training(sizes: Sizes) -> Row:

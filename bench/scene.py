@@ -80,6 +80,27 @@ def imitation(num_starts: int, poses: int, queries: int, seed: int = 0) -> dict[
     return {name: np.asarray(array, np.float32) for name, array in arrays.items()}
 
 
+def motion(poses: int, queries: int) -> dict[str, np.ndarray]:
+    """An imitation, and another sample of the new mug after a motion of 20 degrees and 4 cm.
+
+    Args:
+        poses: number of poses of the trajectory.
+        queries: number of query points.
+
+    Returns:
+        As `imitation` without starts and goal, and "moved": the cloud after the motion, (256, 3).
+    """
+    arrays = imitation(1, poses, queries)
+    R_new, shift = Rotation.random(random_state=0), np.array([0.1, -0.05, 0.02])
+    # The query points are about the handle, as users place them, so that they determine the pick.
+    arrays["query"] = np.asarray(tdf.box_query(jax.random.key(0), count=queries, size=0.06), np.float32)
+    turn = Rotation.from_rotvec(np.radians(20) * np.array([0.6, -0.48, 0.64]))
+    again = tdf.thin(tdf.sample_surface(mug_of(0, 1, HEIGHT).mesh, 1500, 2), 256)
+    arrays["moved"] = (turn.apply(R_new.apply(again)) + shift + [0.02, 0.02, -0.028]).astype(np.float32)
+    del arrays["starts"], arrays["goal"]
+    return arrays
+
+
 def batch(clouds: int, points: int, queries: int) -> dict[str, np.ndarray]:
     """A training batch.
 

@@ -138,6 +138,7 @@ from tdf_jax.solvers.imitation_scene import (
 from tdf_jax.solvers.multistart import SolveConfig as SolveConfig, solve as solve
 from tdf_jax.solvers.pick import CarryConfig as CarryConfig, carry as carry
 from tdf_jax.solvers.result import Result as Result
+from tdf_jax.solvers.tracking import TrackConfig as TrackConfig, track as track
 from tdf_jax.uncertainty.calibration import (
     confidence as confidence,
     recognition as recognition,
@@ -258,6 +259,8 @@ __all__ = [
     "TdfWarning",
     "thin",
     "tilt_and_pour",
+    "track",
+    "TrackConfig",
     "Trajectory",
     "trajectory_descriptor",
     "trajectory_energy",

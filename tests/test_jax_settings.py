@@ -234,6 +234,7 @@ CALLS = {
     "surface_logit": lambda w: tdf.surface_logit(w.field, w.cloud),
     "thin": lambda w: tdf.thin(w.shown, 5),
     "tilt_and_pour": lambda w: tdf.tilt_and_pour(**SHAPE),
+    "track": lambda w: tdf.track(w.field, w.reference, w.result, goal=w.goal),
     "trajectory_descriptor": lambda w: tdf.trajectory_descriptor(w.field, w.path, w.query),
     "trajectory_energy": lambda w: tdf.trajectory_energy(w.path, w.field, w.reference, tdf.EnergyWeights()),
     "turns": lambda w: tdf.turns(w.vector, 3, w.axes),
@@ -253,6 +254,7 @@ NO_CALL = {
     "Robot": "by load_robot",
     **dict.fromkeys(("EnergyWeights", "Model", "Reference"), "arrays that other calls make and take"),
     **dict.fromkeys(("CarryConfig", "ClearanceConfig", "OptimizeConfig", "SolveConfig"), "numbers of Python"),
+    "TrackConfig": "numbers of Python",
     **dict.fromkeys(("BottleParameters", "BowlParameters", "MugParameters"), "numbers of Python"),
     **dict.fromkeys(("ContainerParameters", "RackParameters"), "numbers of Python"),
     **dict.fromkeys(("ModelInfo", "NetworkConfig"), "numbers of Python"),
@@ -396,6 +398,7 @@ NO_GRADIENT = {
     "carry": (lambda w, x: followed(tdf.carry(w.field, w.reference, KEY, goal=x, config=CARRY)), "goal"),
     "pose_covariance": (lambda w, x: tdf.pose_covariance(w.field, w.reference, x).covariance, "pose"),
     "solve": (lambda w, x: followed(tdf.solve(w.field, w.reference, KEY, goal=x, config=SOLVE)), "goal"),
+    "track": (lambda w, x: followed(tdf.track(w.field, w.reference, w.result, goal=x)), "goal"),
 }
 # Functions of one array that compute with its numbers.
 REFUSED = {

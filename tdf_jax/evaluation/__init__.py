@@ -33,5 +33,6 @@ Modules:
     statistics: success thresholds and bootstrap intervals
     tabletop: clouds of an object on a table, from depth images, and with foreign points
     tables: tables as Markdown and as text
+    tracking_study: picks on objects that moved, tracked and found anew
     view_study: picks before and after a second view
 """

@@ -8,4 +8,5 @@ Modules:
     multistart: `solve`: Gauss-Newton from many starts in stages
     pick: `carry`: finds the pick and warps the demonstration from there to the goal
     result: result of any solver
+    tracking: `track`: the pick on an object that moved, from the last pick
 """

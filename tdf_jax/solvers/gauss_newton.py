@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from tdf_jax._internal import devices
@@ -43,7 +44,9 @@ class Problem(NamedTuple):
     centre: Float[Array, "3"]
 
 
-def in_blocks(reference: Reference, order: Int[Array, "blocks size"], counts: Bool[Array, "blocks size"]) -> Problem:
+def in_blocks(
+    reference: Reference, order: Int[Array | np.ndarray, "blocks size"], counts: Bool[Array | np.ndarray, "blocks size"]
+) -> Problem:
     """Arrange the query points of a reference in blocks.
 
     Args:

@@ -59,12 +59,7 @@ def prepare(
     devices.check_device_mesh(function, device_mesh)
     if fix_last and reference.trajectory.num_poses == 1:
         raise InputError(f"{function}: the trajectory has one pose and fix_last keeps it; expected fix_last=False")
-    channels = field.conditioned.config.channels
-    if reference.descriptors.shape[-1] != channels:
-        raise InputError(
-            f"{function}: the reference has {reference.descriptors.shape[-1]} channels and the field {channels}; "
-            "expected both from the same model"
-        )
+    check_channels(function, field, reference)
     if starts is None:
         checks.key(function, key)
         goal = default_goal(field, reference) if goal is None and fix_last else goal
@@ -91,6 +86,16 @@ def prepare(
         initial[:, -1] = goal
     _check_poses(initial)
     return initial, energy
+
+
+def check_channels(function: str, field: DescriptorField, reference: Reference) -> None:
+    """Raise InputError unless field and reference have descriptors of as many channels."""
+    channels = field.conditioned.config.channels
+    if reference.descriptors.shape[-1] != channels:
+        raise InputError(
+            f"{function}: the reference has {reference.descriptors.shape[-1]} channels and the field {channels}; "
+            "expected both from the same model"
+        )
 
 
 def _check_poses(starts):

@@ -129,7 +129,7 @@ def carry(
         raise InputError("carry(): there is a goal, and fix_last=False does not keep it; drop one of them")
     if fix_last:
         goal = jnp.asarray(checks.pose("carry()", "goal", default_goal(field, reference) if goal is None else goal))
-    pick = Reference(reference.descriptors[:1], Trajectory(reference.trajectory.wxyz_xyz[:1]), reference.query)
+    pick = pick_of(reference)
     result = solve(
         field,
         pick,
@@ -150,6 +150,17 @@ def carry(
         residual = pick_residual(float(result.loss), pick.descriptors[0]) if result.finite.any() else np.nan
         residual = np.asarray(residual, result.energies.dtype)
     result = dataclasses.replace(
-        result, trajectories=trajectories[:count], initial_trajectories=trajectories[count:], residual=residual
+        result,
+        trajectories=trajectories[:count],
+        initial_trajectories=trajectories[count:],
+        residual=residual,
+        origin=field.origin,
+        latent=field.latent,
+        first_residual=residual,
     )
     return with_ends(result, reference)
+
+
+def pick_of(reference: Reference) -> Reference:
+    """The pick alone, a demonstration of one pose."""
+    return Reference(reference.descriptors[:1], Trajectory(reference.trajectory.wxyz_xyz[:1]), reference.query)

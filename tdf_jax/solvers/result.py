@@ -38,6 +38,14 @@ def _nowhere() -> np.ndarray:
     return np.full(3, np.nan, jax.dtypes.canonicalize_dtype(np.float64))
 
 
+def _no_latent() -> np.ndarray:
+    return np.zeros((0, 3), np.float32)
+
+
+def _no() -> np.ndarray:
+    return np.zeros((), bool)
+
+
 def _unknown() -> np.ndarray:
     return np.full((), np.nan, np.float32)
 
@@ -62,6 +70,10 @@ def _unknown() -> np.ndarray:
         "target_foreign_points",
         "points_at_pick",
         "look_from",
+        "origin",
+        "latent",
+        "first_residual",
+        "lost",
     ],
     meta_fields=["grasp", "release"],
 )
@@ -107,6 +119,10 @@ class Result:
             `imitate` where it gives a confidence, else -1.
         look_from: direction from the object towards a camera that would see what is expected and not seen yet, (3,),
             unit vector, world frame; set by `imitate` where the confidence is below one half, else NaN.
+        origin: origin of the object's field, (3,), metres, world frame; NaN for solvers but `carry` and `track`.
+        latent: latent of that field, (latent, 3); empty for solvers but `carry` and `track`.
+        first_residual: residual of the pick of `carry` that `track` began with; of `carry` its own. NaN for others.
+        lost: whether `track` did not find the pick again; a scalar. A lost result has no best candidate.
         grasp: index of the pose at which the object is grasped; poses before it are the approach.
         release: index of the pose at which it is released, from the end: -1 unless there is a retreat.
     """
@@ -129,6 +145,10 @@ class Result:
     target_foreign_points: Int[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_none)
     points_at_pick: Int[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_uncounted)
     look_from: Float[Array | np.ndarray, "*batch 3"] = dataclasses.field(default_factory=_nowhere)
+    origin: Float[Array | np.ndarray, "*batch 3"] = dataclasses.field(default_factory=_nowhere)
+    latent: Float[Array | np.ndarray, "*batch latent 3"] = dataclasses.field(default_factory=_no_latent)
+    first_residual: Float[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_unknown)
+    lost: Bool[Array | np.ndarray, "*batch"] = dataclasses.field(default_factory=_no)
     grasp: int = 0
     release: int = -1
 
@@ -145,9 +165,15 @@ class Result:
         """Index of the finite candidate with the least energy; of a batch, one for each result.
 
         Raises:
-            InputError: no candidate is finite. Traced values are not checked: index 0 is taken.
+            InputError: no candidate is finite, or the pick is lost. Traced values are not checked: index 0 is taken,
+                and `lost` says whether the pick is.
         """
         finite, xp = self.finite, self._numpy
+        if not checks.traced(self.lost) and np.asarray(self.lost).any():
+            raise InputError(
+                f"Result.best: {self.status}; expected a pick that `track` found. Call carry(), or take "
+                "result.trajectories to see where the search ended"
+            )
         if not checks.traced(finite) and not np.asarray(finite).any(axis=-1).all():
             raise InputError(
                 f"Result.best: {self.status}; check the weights and the query points, or, with Adam, lower "
@@ -198,7 +224,13 @@ class Result:
     @public
     def status(self) -> str:
         """How the candidates ended, in words."""
-        finite = np.asarray(self.finite)
+        finite, lost = np.asarray(self.finite), np.asarray(self.lost)
+        if lost.any():
+            which = f"{np.count_nonzero(lost)} of {lost.size} picks are lost" if lost.ndim else "the pick is lost"
+            found, before = np.asarray(self.residual), np.asarray(self.first_residual)
+            with np.errstate(all="ignore"):
+                ratios = ", ".join(f"{ratio:.2g}" for ratio in np.atleast_1d(found / before)[np.atleast_1d(lost)])
+            return f"{which}: the energy is {ratios} times that of the pick of carry()"
         failed, kind = np.argwhere(~finite), "candidates" if self._pruned else "starts"
         if len(failed) == 0:
             return f"all {finite.size} {kind} finite"
@@ -267,7 +299,7 @@ class Result:
         if any(removed.values()):
             words = ", ".join(f"{number} of the {name}'s cloud" for name, number in removed.items() if number)
             rows["foreign points"] = f"removed {words}"
-        if not np.asarray(self.finite).any():
+        if not np.asarray(self.finite).any() or np.asarray(self.lost):
             return rows
         pick = np.asarray(self.picks)[self.best]
         energies = np.sort(np.asarray(self.energies)[np.asarray(self.finite)])

@@ -190,6 +190,7 @@ def test_full_sizes_have_the_rows_and_their_operations():
         "target_rates",
         "landscape",
         "train",
+        "track",
     ]
 
 
