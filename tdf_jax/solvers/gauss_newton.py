@@ -61,7 +61,7 @@ def in_blocks(
     centre = jnp.mean(query, axis=0)
     return Problem(
         query=(query - centre)[order],
-        weights=counts.astype(query.dtype),
+        weights=jnp.asarray(counts, query.dtype),
         descriptors=descriptors[:, order],
         target=reference.trajectory.wxyz_xyz,
         centre=centre,
