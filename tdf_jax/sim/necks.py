@@ -6,16 +6,16 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from tdf_jax.sim.pads import TIPS, turned_about_approach
+from tdf_jax.sim.pads import TIPS, flush_turn, turned_about_approach
 from tdf_jax.sim.robot import Fingers
 
 CLEARANCE, LEAST_CLEARANCE = 0.010, 0.005  # metres between each finger and a neck, whose middle the cloud shows well
-DEPTHS = (0.012, 0.052)  # metres from the end of the neck to the tips; the palm is 0.055 m behind them
+DEPTHS = (0.012, 0.049)  # metres from the end of the neck to the tips; the palm is 0.055 m behind them
 LEVEL_STEP = 0.001  # metres between levels at which a neck is measured
 TOUCHED = 0.0003  # metres: pads touch where the width is the largest between them, up to this
-# Metres from the tips within which pads slide off a slope, and beyond which the fingers of the 2F-85, which adapt to
-# what they enclose, give way; and the share that a grasp is worth there.
-EDGE, UNSTEADY, AT_EDGE = 0.005, 0.009, 0.3
+STEADY = np.radians(1)  # a neck that closing pads turn by so much is held half as well as one that stays
+# Metres from the tips within which pads slide off a slope, and the share that a grasp is worth there.
+EDGE, AT_EDGE = 0.005, 0.3
 STEEP = 0.4  # radius over length of a slope on which the tips do not hold at all
 NEAR = 0.020  # metres between pads and centre of mass, below which nearer is no better
 RECESS = 0.003  # metres by which the fingers are further apart behind the pads
@@ -27,8 +27,13 @@ STEEPEST, FARTHEST = np.radians(20), 0.015  # largest turn onto the axis, radian
 # Metres beyond the tips up to which a neck is sought: descriptors know its axis better than the height on it.
 BEYOND = (0.02, 0.004)
 GAP = 0.008  # metres along a neck without points, beyond which is something else
+# Points of the inside of a hollow neck have others outside of them, on both sides along the axis, where those of a
+# neck above a shoulder have them on one: further from the axis by this, and near the line outwards, across and along
+# the axis, metres.
+OUTSIDE, ACROSS, LEVEL = 0.0015, 0.006, 0.012
+SHOULDER = 1.4  # points further out than this many medians of the radius are of a shoulder
 FINE, SMOOTH = 0.003, 0.2  # metres between the knots of a neck's radii, and the weight of their bends
-TOUCHED_POINTS = 0.0006  # metres, as TOUCHED, of widths by points
+UNSURE, WORST = 2, 1e-4  # levels by which the depth of a neck in a cloud may be off; score where pads cannot hold
 ALONG, WORTH = 0.04, 0.03  # metres: largest movement along a neck, and the one for which pads must hold e times better
 # Sine of the tilt of a neck from which on the turn about it matters, and turns about the best one, radians.
 TILTED, OFF_PLANE = 0.02, tuple(np.radians([0.0, 5.0, -5.0]))
@@ -51,25 +56,22 @@ class Hold(NamedTuple):
 
 
 def neck_holds(
-    levels: Float[np.ndarray, " levels"],
-    widths: Float[np.ndarray, " levels"],
-    centre: float,
-    widest: float,
-    touched: float = TOUCHED,
+    levels: Float[np.ndarray, " levels"], widths: Float[np.ndarray, " levels"], centre: float, widest: float
 ) -> list[Hold]:
     """The depths at which pads can hold a neck.
 
-    Pads are flat, and touch a cone at its widest ring only. A depth is better where what they touch is long, wide and
-    near the centre of mass, and lies within the pads: their tips would slide off a slope.
+    Closing pads turn a neck until it is narrowest between them: a cone lies flush with one of them, and a bottle that
+    is held at a ring turns until something beside the ring touches too. A depth is better where that turn is small,
+    where the pads are near the centre of mass, and where their tips do not slide off a slope. Depths are exact to some
+    levels only, so a score is the geometric mean over `UNSURE` levels either way.
 
     Args:
         levels: distances from the end of the neck, (levels,), metres, `LEVEL_STEP` apart.
         widths: widths of the object there, (levels,), metres.
         centre: distance of its centre of mass from the end of the neck, metres.
         widest: the widest opening of the gripper, metres.
-        touched: pads touch where the width is the largest between them, up to this, metres.
     """
-    holds = []
+    holds, scores = {}, np.full(len(levels) + 2 * UNSURE, WORST)
     for tips in np.flatnonzero(levels >= DEPTHS[0]):
         depth, inserted = levels[tips], widths[: tips + 1]
         pads = levels[: tips + 1] > depth - 2 * TIPS
@@ -77,16 +79,18 @@ def neck_holds(
         clearance = min(CLEARANCE, (widest - float(inserted.max())) / 2)
         if clearance < LEAST_CLEARANCE or inserted.max() > width + RECESS:
             continue
-        at = levels[: tips + 1][pads & (inserted > width - touched)]
-        length, lever = float(np.ptp(at)), abs(float(at.mean()) - centre)
-        score = (width + 2 * length) / max(lever, NEAR)
-        if depth - at.mean() < EDGE:
+        sides = np.concatenate([inserted, -inserted]) / 2
+        section = np.column_stack([np.zeros(len(sides)), sides, np.tile(levels[: tips + 1], 2)])
+        turn, _ = flush_turn(section, depth + LEVEL_STEP / 2, depth - TIPS)
+        touching = float(levels[: tips + 1][pads & (inserted > width - TOUCHED)].mean())
+        score = 1 / (1 + abs(turn / STEADY) ** 3) / max(abs(touching - centre), NEAR)
+        if depth - touching < EDGE:
             slope = float(inserted[-1] - inserted[max(0, tips - 3)]) / (6 * LEVEL_STEP)
             score *= AT_EDGE * min(max(1 - slope / STEEP, 0.01), 1)
-        elif depth - at.max() > UNSTEADY:
-            score *= AT_EDGE
-        holds.append(Hold(float(depth), width, float(inserted.max()) + 2 * clearance, score))
-    return holds
+        scores[tips + UNSURE] = max(score, WORST)
+        holds[tips] = Hold(float(depth), width, float(inserted.max()) + 2 * clearance, 0.0)
+    means = np.exp(np.lib.stride_tricks.sliding_window_view(np.log(scores), 2 * UNSURE + 1).mean(axis=1))
+    return [one._replace(score=float(means[tips])) for tips, one in holds.items()]
 
 
 def neck_grasps(
@@ -120,13 +124,13 @@ def neck_grasps(
 def _deepened(T, points, tip: float, fingers: Fingers) -> tuple[np.ndarray, float] | None:
     """A grasp along the axis of a neck, moved along it to where pads hold best, and the opening there."""
     x, y, z = ((points - T[:3, 3]) @ T[:3, :3]).T
-    radii = np.hypot(x, y)
-    along = np.sort(z[radii < fingers.widest / 2])
+    along = np.sort(z[np.hypot(x, y) < fingers.widest / 2])
     ends = np.flatnonzero((np.diff(along) > GAP) & (along[:-1] < tip))
     end = float(along[ends[-1] + 1 if len(ends) else 0])
     levels = np.arange(LEVEL_STEP, DEPTHS[1], LEVEL_STEP)
-    widths = 2 * _profile(z - end, radii, levels)
-    holds = neck_holds(levels, widths, float(z.mean()) - end, fingers.widest, TOUCHED_POINTS)
+    outside = _outside(x, y, z, end + DEPTHS[1])
+    widths = 2 * _profile(z[outside] - end, np.hypot(x, y)[outside], levels)
+    holds = neck_holds(levels, widths, float(z.mean()) - end, fingers.widest)
     moves = [end + one.depth - fingers.tip(one.width) for one in holds]
     reached = [number for number, move in enumerate(moves) if abs(move) < ALONG]
     if not reached:
@@ -135,6 +139,19 @@ def _deepened(T, points, tip: float, fingers: Fingers) -> tuple[np.ndarray, floa
     T = T.copy()
     T[:3, 3] += moves[best] * T[:3, 2]
     return T, holds[best].opening
+
+
+def _outside(x, y, z, end: float) -> np.ndarray:
+    """Which points up to `end` along the axis, metres, have none outside of them; the others count."""
+    kept, near = np.ones(len(z), bool), np.flatnonzero(z < end)
+    x, y, z = x[near], y[near], z[near]
+    radii = np.maximum(np.hypot(x, y), 1e-9)
+    outwards = (np.outer(x, x) + np.outer(y, y)) / radii[:, None]  # row: along the line outwards through a point
+    across = np.abs(np.outer(x, y) - np.outer(y, x)) / radii[:, None]
+    covers, along = (outwards > radii[:, None] + OUTSIDE) & (across < ACROSS), z - z[:, None]
+    sides = [(covers & (np.abs(along) < LEVEL) & (sign * along >= 0)).any(axis=1) for sign in (1, -1)]
+    kept[near] = ~(sides[0] & sides[1])
+    return kept
 
 
 def _about_neck(T) -> list[np.ndarray]:
@@ -172,7 +189,15 @@ def _along_neck(T, points, widest: float, tip: float, beyond: float):
     for _ in range(2):
         x, y, z = ((points - T[:3, 3]) @ T[:3, :3]).T
         inside = (np.hypot(x, y) < widest / 2) & (z > tip - 2 * TIPS) & (z < tip + beyond)
+        if inside.sum() < LEAST:
+            break
         x, y, z = x[inside], y[inside], z[inside]
+        middle = (x.mean(), y.mean()) if np.isinf(last) else (0.0, 0.0)  # points of a shoulder are on one side
+        outside = _outside(x - middle[0], y - middle[1], z, np.inf)
+        x, y, z = x[outside], y[outside], z[outside]
+        radii = np.hypot(x - middle[0], y - middle[1])
+        slim = radii < SHOULDER * np.median(radii)
+        x, y, z = x[slim], y[slim], z[slim]
         if len(y) < LEAST or np.ptp(z) < SPREAD:
             break
         centre = float(z.mean())

@@ -10,7 +10,7 @@ from tdf_jax.geometry.symmetry import ROUND
 from tdf_jax.shapes import FAMILIES
 from tdf_jax.sim.centring import centred
 from tdf_jax.sim.grasps import grip_of
-from tdf_jax.sim.necks import DEPTHS, LEVEL_STEP, neck_holds
+from tdf_jax.sim.necks import CLEARANCE, DEPTHS, LEVEL_STEP, neck_holds
 
 
 def shape_cloud_and_grip(category, seed, robot):
@@ -124,6 +124,24 @@ def test_on_a_neck_a_grasp_comes_to_the_axis_and_to_where_pads_hold(neck, robot,
     off = [abs(top - one.depth + robot.fingers.tip(one.width) - found[2, 3]) for one in holds]
     near = [one.score for one, distance in zip(holds, off) if distance < 3e-3]
     assert max(near) > 0.2 * max(one.score for one in holds)
+
+
+@pytest.mark.parametrize("degrees", [(4, 0), (-4, 3), (0, -5)])
+def test_the_inside_of_a_hollow_neck_and_a_shoulder_do_not_mislead(robot, degrees):
+    neck = trimesh.creation.annulus(r_min=0.012, r_max=0.017, height=0.04)
+    shoulder = trimesh.creation.cylinder(radius=0.05, height=0.1)
+    neck.apply_translation((0, 0, 0.08))
+    shoulder.apply_translation((0, 0, 0.01))
+    hollow = trimesh.util.concatenate(neck, shoulder)
+    cloud = np.asarray(trimesh.sample.sample_surface(hollow, 3000, seed=0)[0])
+    T = np.diag([-1.0, 1.0, -1.0, 1.0])
+    T[:3, :3] = Rotation.from_euler("xy", degrees, degrees=True).as_matrix() @ T[:3, :3]
+    T[:3, 3] = (0.004, -0.002, 0.08 + robot.fingers.tip(0.034))
+    (found,) = centred(T, cloud, 0.06, robot.fingers)
+    assert np.degrees(np.arccos(-found.T_world_grip[2, 2])) < 0.5
+    at = found.T_world_grip @ (0, 0, robot.fingers.tip(0.034), 1)
+    assert np.linalg.norm(at[:2]) < 5e-4 and 0.06 < at[2] < 0.09
+    assert found.opening == pytest.approx(0.034 + 2 * CLEARANCE, abs=1.5e-3)
 
 
 def test_a_tilted_neck_is_held_where_it_swings_least(neck, robot):
