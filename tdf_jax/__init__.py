@@ -12,6 +12,7 @@
 angles in radians, poses `wxyz_xyz` as in jaxlie, and `T_world_query` is the pose of the query frame in the world.
 """
 
+from tdf_jax import plot as plot
 from tdf_jax._internal.errors import (
     CategoryWarning as CategoryWarning,
     ConfidenceWarning as ConfidenceWarning,
@@ -221,6 +222,7 @@ __all__ = [
     "pick_object",
     "plan_joints",
     "plane_grid",
+    "plot",
     "points_from_depth",
     "pose_covariance",
     "pose_descriptor",

@@ -50,7 +50,7 @@ def imitate(settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()) 
     """Imitate a demonstrated trajectory on a new object; by default on a generated mug in a random pose.
 
     Writes a folder with result.json, trajectory.npz, trajectory.tum, scene.npz, imitation.png and loss.png; with
-    --page also imitation.html.
+    --page also imitation.html. `tdf view` shows the folder.
     """
     settings = resolved(settings)
     pictures = Pictures("tdf imitate")

@@ -32,6 +32,7 @@ COMMANDS = (
     "imitate",
     "demonstrate",
     "landscape",
+    "view",
     "convert",
     "evaluate",
     "benchmark",

@@ -165,6 +165,13 @@ class Demonstration:
                 "points are in metres, that the poses are T_world_query in the frame of the cloud, and grasp"
             )
 
+    @public
+    def _repr_html_(self) -> str | None:
+        from tdf_jax.viz.cards import demonstration_card  # only a notebook asks, see tests/test_layout.py
+
+        traced = checks.traced(self.points, self.trajectory, self.query)
+        return None if traced else demonstration_card(self)
+
     def _check_target(self, target: Target) -> None:
         if not isinstance(target, Target):
             raise InputError(f"Demonstration(): target is a {type(target).__name__}; expected a tdf.Target")

@@ -42,6 +42,14 @@ class Trajectory:
         warn("Trajectory.poses", "Trajectory.num_poses")
         return self.num_poses
 
+    @public
+    def _repr_html_(self) -> str | None:
+        from tdf_jax.viz.cards import trajectory_card  # only a notebook asks, see tests/test_layout.py
+
+        if checks.traced(self.wxyz_xyz) or np.ndim(self.wxyz_xyz) != 2 or not len(self.wxyz_xyz):
+            return None  # the notebook prints `repr` instead
+        return trajectory_card(self)
+
     @property
     @public
     def rotations(self) -> Float[Array, "poses 3 3"]:

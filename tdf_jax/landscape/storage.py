@@ -117,6 +117,11 @@ class Landscape:
             rotation = np.take_along_axis(self.turned.reshape(len(self.values), -1), point[:, None], axis=1)[:, 0]
         return self.rotations[rotation]
 
+    def _repr_html_(self) -> str:
+        from tdf_jax.viz.cards import landscape_card  # only a notebook asks, see tests/test_layout.py
+
+        return landscape_card(self)
+
     @property
     def _best(self):
         """Indices of each waypoint's lowest energy: of the rotation (0 if `values` has one), and of the point."""

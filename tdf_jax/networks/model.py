@@ -53,6 +53,11 @@ class Model:
     config: NetworkConfig
     info: ModelInfo
 
+    def _repr_html_(self) -> str:
+        from tdf_jax.viz.cards import model_card  # only a notebook asks, see tests/test_layout.py
+
+        return model_card(self)
+
 
 def shape_problems(found: Mapping[str, tuple[int, ...]], expected: Mapping[str, tuple[int, ...]]) -> str:
     """Names of the tensors that are missing, unexpected or of another shape; empty if there are none."""

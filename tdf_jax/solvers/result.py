@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import html
 
 import jax
 import jax.numpy as jnp
@@ -277,12 +276,10 @@ class Result:
 
     @public
     def _repr_html_(self) -> str:
-        left = "style='text-align:left'"
-        rows = "".join(
-            f"<tr><th {left}>{html.escape(name)}</th><td {left}>{html.escape(value)}</td></tr>"
-            for name, value in self._summary().items()
-        )
-        return f"<table><caption>Result</caption>{rows}</table>"
+        rows = self._summary()
+        from tdf_jax.viz.cards import card, result_card  # what is displayed may look there, see `_distinct_picks`
+
+        return result_card(self, rows) if "pick" in rows else card("Result", rows, None)
 
     def _summary(self) -> dict[str, str]:
         """Rows that `repr` prints; of traced values and batches, shapes only."""

@@ -3,6 +3,7 @@
 Importing this package imports matplotlib and, for that moment, hides MPLBACKEND.
 
 Modules:
+    cards: how objects show themselves in a notebook
     contact_sheet: many objects side by side
     evaluation: pictures of the benchmark
     html: page of an energy landscape
@@ -17,6 +18,7 @@ Modules:
     reconstruction: surfaces and transfers
     relations: an object placed on a target
     scene3d: an object with a trajectory
+    single: pictures on given axes, for `tdf.plot`
     style: colours, sizes, saving
     training: curves of a training run
 """

@@ -6,12 +6,12 @@ import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.viz.scene3d import View, bounds, content, draw, frame, triangles_of, waypoint_bar
-from tdf_jax.viz.style import CLOUD, COLOURS, STYLE, add_axes3d, blank_figure, legend_of
+from tdf_jax.viz.single import losses_panel
+from tdf_jax.viz.style import STYLE, add_axes3d, blank_figure, legend_of
 
 if TYPE_CHECKING:
     import trimesh
@@ -73,20 +73,9 @@ def loss_figure(
         title: title above the axes.
         rows: name of a row in the legend; the rows of the solver are candidates.
     """
-    losses = np.asarray(losses)
-    steps = np.arange(losses.shape[1])
     with matplotlib.rc_context(STYLE):
         figure = blank_figure(4.8, 3.2, layout="constrained")
         axes = figure.add_subplot()
-        for index, row in enumerate(losses):
-            if index != best:
-                axes.plot(steps, row, color=CLOUD, lw=0.7, alpha=0.8, label=f"other {rows}s")
-        axes.plot(steps, losses[best], color=COLOURS(0.35), lw=2.0, label=f"best, {rows} {best + 1} of {len(losses)}")
-        legend = legend_of(axes)
-        axes.legend(legend.values(), legend.keys(), frameon=False)
-        axes.set(xlabel="iteration", ylabel="loss (no unit)", title=title, xlim=(0, max(1, steps[-1])))
-        axes.set_ylim(bottom=0)
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(alpha=0.25, lw=0.5)
+        losses_panel(axes, losses, best, rows, "iteration")
+        axes.set_title(title)
     return figure

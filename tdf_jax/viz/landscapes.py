@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 import matplotlib
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -113,6 +114,27 @@ def map_figure(landscape: Landscape, marks: Marks, title: str = "") -> Figure:
         )
         figure.suptitle(title)
     return figure
+
+
+def map_panel(axes: Axes, landscape: Landscape, marks: Marks) -> None:
+    """Draw the combined energy on given axes: of a plane, or of the middle slice of a volume along its last axis.
+
+    Args:
+        axes: plane axes of matplotlib.
+        landscape: landscape of a grid with two or three axes, in one orientation or the best of several.
+        marks: marks on the landscape; on a slice of a volume, there are none.
+    """
+    shape = landscape.grid.shape
+    check_landscape("map_panel", landscape, axes=3 if len(shape) == 3 else 2)
+    energy = landscape.combined if len(shape) == 2 else landscape.combined[..., shape[2] // 2]
+    first, second = (CENTIMETRES * steps for steps in landscape.grid.coordinates[:2])
+    low, high = np.nanmin(energy), np.nanquantile(energy, 0.99)
+    picture = _map(axes, first, second, energy, low, high)
+    if len(shape) == 2:
+        _mark(axes, landscape, marks, slice(None), whole=True)
+    names = [_axis_name(direction) for direction in landscape.grid.directions]
+    axes.set(xlabel=f"{names[0]} from the middle (cm)", ylabel=f"{names[1]} from the middle (cm)")
+    axes.figure.colorbar(picture, ax=axes, label="energy (no unit)", shrink=0.8)
 
 
 def isosurface_figure(landscape: Landscape, marks: Marks, title: str = "") -> Figure:
@@ -284,10 +306,11 @@ def _mark(axes, landscape, marks, chosen, whole):
 
     offsets = marks.points - grid.origin
     off = np.linalg.norm(offsets - (offsets @ grid.directions.T) @ grid.directions, axis=1)
-    near = marks.points[off < max(NEAR * grid.steps.max(), 0.1 * off.max())]
+    near = marks.points[off < max(NEAR * grid.steps.max(), 0.1 * off.max(initial=0.0))]
     axes.scatter(*flat(near), s=0.8, color="white", alpha=0.7, linewidths=0)
     if whole:
-        axes.plot([], [], ".", color="white", ms=3, label="object's points near the plane")
+        if len(marks.points):
+            axes.plot([], [], ".", color="white", ms=3, label="object's points near the plane")
         for points, style in path_lines(landscape, marks)[:-1]:
             axes.plot(*flat(points), **({"lw": 1.0, "ms": 3, "mec": INK, "mew": 0.4} | style))
     axes.plot(*flat(landscape.minimisers[chosen]), **({"ms": 5, "mew": 1.3} | _MINIMISERS))

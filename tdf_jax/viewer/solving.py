@@ -1,0 +1,298 @@
+"""What the viewer computes: the pick on an object that was dragged, the path to a goal, and energies of poses."""
+
+import dataclasses
+import functools
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from tdf_jax._internal.errors import InputError
+from tdf_jax.energy.descriptors import pose_descriptor
+from tdf_jax.energy.losses import EnergyWeights
+from tdf_jax.energy.reference import Reference, describe
+from tdf_jax.energy.residual import pick_residual
+from tdf_jax.geometry import se3
+from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.geometry.transport import carry_to_picks
+from tdf_jax.networks.checkpoint import load_model
+from tdf_jax.networks.encoding import encode
+from tdf_jax.networks.field import DescriptorField
+from tdf_jax.networks.model import Model, fingerprint
+from tdf_jax.networks.surface import surface_triangles
+from tdf_jax.solvers.imitation_scene import ImitationScene
+from tdf_jax.solvers.multistart import SolveConfig, solve
+from tdf_jax.uncertainty.calibration import CALIBRATED, confidence
+from tdf_jax.uncertainty.modes import Mode, cluster_poses
+
+IDENTITY = np.array([1.0, 0, 0, 0, 0, 0, 0])
+# Three starts near the answer need few steps: the last pick, where the drag takes it, and half-way.
+NEAR = SolveConfig(
+    num_starts=3,
+    num_trajectory_starts=1,
+    num_candidates=1,
+    coarse_steps=6,
+    prune_steps=1,
+    search_steps=1,
+    propagate_steps=1,
+    refine_steps=4,
+    polish_steps=10,
+)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Problem:
+    """What the viewer solves again and again.
+
+    Attributes:
+        scene: the imitation that is shown.
+        model: its network.
+        reference: its demonstration, described.
+        points: cloud of the new object in its initial pose, (points, 3), metres, world frame.
+        field: field of that cloud.
+        goals: goal of every candidate, T_world_query, (candidates, 7).
+    """
+
+    scene: ImitationScene
+    model: Model
+    reference: Reference
+    points: Float[np.ndarray, "points 3"]
+    field: DescriptorField
+    goals: Float[np.ndarray, "candidates 7"]
+
+    @functools.cached_property
+    def modes(self) -> list[Mode]:
+        """Distinct picks by rising energy."""
+        return cluster_poses(jnp.asarray(self.scene.result.picks), jnp.asarray(self.scene.result.energies))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Found:
+    """A pick with its path, as the viewer shows it.
+
+    Attributes:
+        pick: T_world_query at the grasp, `wxyz_xyz`, (7,).
+        goal: T_world_query at the release.
+        path: T_world_query of every pose, approach and retreat included, (poses, 7).
+        energy: energy of the pick's descriptors (eq. 2 of one waypoint).
+        motion: where the object was dragged to, `wxyz_xyz`: a point x of `Problem.points` is at M x.
+        confidence: probability that the pick is right, see `tdf_jax.confidence`; NaN where it is not calibrated.
+        seconds: time of the encoding and of the search, seconds; None if nothing was searched.
+    """
+
+    pick: Float[np.ndarray, "7"]
+    goal: Float[np.ndarray, "7"]
+    path: Float[np.ndarray, "poses 7"]
+    energy: float
+    motion: Float[np.ndarray, "7"]
+    confidence: float = np.nan
+    seconds: tuple[float, float] | None = None
+
+
+def model_of(scene: ImitationScene, weights: str | None) -> Model:
+    """The network that an imitation was made with.
+
+    Args:
+        scene: the imitation.
+        weights: name or file of the weights; None for what the scene names.
+
+    Raises:
+        InputError: the scene names no weights, they cannot be read, or they are others than those of the scene.
+    """
+    kept = scene.weights
+    if weights is None and kept is None:
+        raise InputError("tdf view: the scene names no weights; expected --weights NAME or FILE")
+    name = weights if weights is not None else kept.name  # pyright: ignore[reportOptionalMemberAccess]
+    if weights is None and name.endswith(".safetensors") and not Path(name).is_file():
+        raise InputError(
+            f"tdf view: the imitation was made with the weights {name}, and there is no such file; expected it there, "
+            "or --weights FILE"
+        )
+    model = load_model(name)
+    if kept is not None and fingerprint(model) != kept.fingerprint:
+        raise InputError(
+            f"tdf view: the weights {name} are not those that the imitation was made with ({kept.name}, "
+            f"{kept.fingerprint[:12]}); expected the same, whose descriptors and energies are comparable: give "
+            "--weights FILE, or run `tdf imitate` again"
+        )
+    return model
+
+
+def problem_of(scene: ImitationScene, model: Model) -> Problem:
+    """Encode an imitation's object and describe its demonstration.
+
+    Args:
+        scene: the imitation.
+        model: its network.
+    """
+    alone = dataclasses.replace(scene.demonstration, target=None)
+    clean = int(scene.result.foreign_points) > 0
+    field, kept = encode(model, scene.points, clean=clean, return_kept=True)
+    trajectories = np.asarray(scene.result.trajectories)
+    return Problem(
+        scene,
+        model,
+        describe(model, alone),
+        np.asarray(scene.points)[np.asarray(kept)],
+        field,
+        trajectories[:, scene.result.release],
+    )
+
+
+def chosen(problem: Problem, number: int) -> Found:
+    """The result of the folder: one of its distinct picks.
+
+    Args:
+        problem: the problem.
+        number: index of the distinct pick, by rising energy.
+    """
+    index = int(problem.modes[number].members[0])
+    result = problem.scene.result
+    path = np.asarray(result.trajectories)[index]
+    energy = float(problem.modes[number].energy)
+    confident = float(result.confidence) if number == 0 else np.nan
+    return Found(path[result.grasp], path[result.release], path, energy, IDENTITY.copy(), confident)
+
+
+def dragged(problem: Problem, motion: Float[np.ndarray, "7"], last: Found) -> Found:
+    """Find the pick on the object where it was dragged to, from the last pick.
+
+    The object is encoded anew there, as if a camera saw it. The goal is that of the last result; an object that is
+    placed on a target keeps its place there instead, and the goal follows from the pick.
+
+    Args:
+        problem: the problem.
+        motion: M, `wxyz_xyz`: a point x of `problem.points` is at M x.
+        last: the last result.
+    """
+    began = time.perf_counter()
+    points = np.asarray(se3.transform(jnp.asarray(motion, jnp.float32), jnp.asarray(problem.points, jnp.float32)))
+    field = jax.block_until_ready(encode(problem.model, points, clean=False))
+    encoded = time.perf_counter()
+    step = se3.compose(jnp.asarray(motion), se3.inverse(jnp.asarray(last.motion)))
+    with_it = np.asarray(se3.compose(step, jnp.asarray(last.pick)))
+    starts = np.stack([last.pick, with_it, _between(last.pick, with_it)])[:, None]
+    reference = problem.reference
+    one = Reference(reference.descriptors[:1], Trajectory(reference.trajectory.wxyz_xyz[:1]), reference.query)
+    result = solve(
+        field,
+        one,
+        jax.random.key(0),
+        fix_last=False,
+        energy=EnergyWeights(0.0),
+        config=NEAR,
+        starts=starts.astype(np.float32),
+    )
+    pick = np.asarray(result.pick)
+    energy = float(result.loss)
+    goal = last.goal
+    if problem.scene.demonstration.target is not None:
+        released = se3.compose(jnp.asarray(last.goal), se3.inverse(jnp.asarray(last.pick)))  # the object's motion
+        goal = np.asarray(se3.compose(se3.compose(released, se3.inverse(step)), jnp.asarray(pick)))
+    seconds = (encoded - began, time.perf_counter() - encoded)
+    path = path_between(problem, pick, goal)
+    return Found(pick, goal, path, energy, np.asarray(motion), _confidence(problem, energy), seconds)
+
+
+def regoaled(problem: Problem, goal: Float[np.ndarray, "7"], last: Found) -> Found:
+    """The same pick, with the demonstration warped to another goal.
+
+    Args:
+        problem: the problem.
+        goal: the goal, T_world_query, `wxyz_xyz`.
+        last: the last result.
+    """
+    return dataclasses.replace(last, goal=np.asarray(goal), path=path_between(problem, last.pick, goal), seconds=None)
+
+
+def path_between(
+    problem: Problem, pick: Float[np.ndarray, "7"], goal: Float[np.ndarray, "7"]
+) -> Float[np.ndarray, "poses 7"]:
+    """The demonstration warped to a pick and a goal, with its approach and its retreat, (poses, 7).
+
+    Args:
+        problem: the problem.
+        pick: T_world_query at the grasp, `wxyz_xyz`, (7,).
+        goal: T_world_query at the release.
+    """
+    reference = problem.reference
+    transfer = carry_to_picks(
+        reference.trajectory, jnp.asarray(pick, jnp.float32)[None], jnp.asarray(goal, jnp.float32)
+    )[0]
+    demonstrated = reference.trajectory.wxyz_xyz
+    parts = [
+        se3.compose(se3.compose(transfer[0], se3.inverse(demonstrated[0])), reference.approach),
+        transfer,
+        se3.compose(se3.compose(transfer[-1], se3.inverse(demonstrated[-1])), reference.retreat),
+    ]
+    return np.concatenate([np.asarray(part).reshape(-1, 7) for part in parts])
+
+
+def energy_at(problem: Problem, found: Found, pose: Float[np.ndarray, "7"]) -> float:
+    """Energy of the pick's descriptors at a pose of the query frame (eq. 2 of one waypoint).
+
+    Args:
+        problem: the problem.
+        found: the result, whose object the pose is at.
+        pose: T_world_query, `wxyz_xyz`, (7,).
+    """
+    # In the initial pose of the object, whose field is known: the network turns with its cloud.
+    pose = se3.compose(se3.inverse(jnp.asarray(found.motion, jnp.float32)), jnp.asarray(pose, jnp.float32))
+    return float(_energy(problem.field, pose, problem.reference.query, problem.reference.descriptors[0]))
+
+
+@jax.jit
+def _energy(field, pose, query, descriptors):
+    return jnp.mean(jnp.abs(pose_descriptor(field, pose, query) - descriptors))
+
+
+def point_under(
+    points: Float[np.ndarray, "points 3"],
+    origin: Float[np.ndarray, "3"],
+    direction: Float[np.ndarray, "3"],
+    reach: float,
+) -> Float[np.ndarray, "3"] | None:
+    """The point of a cloud that a ray meets first; None if it passes by.
+
+    Args:
+        points: cloud, (points, 3), metres.
+        origin: where the ray begins, (3,).
+        direction: its direction, (3,).
+        reach: largest distance of a point from the ray, metres.
+    """
+    direction = np.asarray(direction, float) / np.linalg.norm(direction)
+    relative = np.asarray(points, float) - origin
+    along = relative @ direction
+    aside = np.linalg.norm(relative - along[:, None] * direction, axis=1)
+    near = np.flatnonzero((aside < reach) & (along > 0))
+    return None if not len(near) else np.asarray(points[near[np.argmin(along[near])]], float)
+
+
+def reconstructed(problem: Problem) -> Float[np.ndarray, "faces 3 3"]:
+    """The surface that the network sees: where the occupancy of the field is 1/2, (faces, 3, 3), metres, world frame.
+
+    Args:
+        problem: the problem, whose object is in its initial pose.
+
+    Raises:
+        InputError: libigl is not installed.
+    """
+    bounds = np.stack([problem.points.min(axis=0), problem.points.max(axis=0)])
+    return surface_triangles(problem.field, np.eye(4), bounds)
+
+
+def _confidence(problem: Problem, energy: float) -> float:
+    if problem.model.info.name not in CALIBRATED:
+        return np.nan
+    probability = confidence(pick_residual(energy, problem.reference.descriptors[0]))
+    return np.nan if probability is None else probability
+
+
+def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The pose half-way between two."""
+    pair = jnp.asarray(np.stack([a, b]), jnp.float32)
+    R = se3.geodesic(se3.rotation(pair[0]), se3.rotation(pair[1]), jnp.array([0.5]))
+    return np.asarray(se3.pose(R, pair[:, 4:].mean(axis=0)[None]))[0]

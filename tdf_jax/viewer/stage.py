@@ -1,0 +1,455 @@
+"""A folder of results on the screen: what is shown, what the panel says, and what the mouse does."""
+
+import threading
+import time
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from tdf_jax._internal.errors import InputError
+from tdf_jax.geometry import se3
+from tdf_jax.landscape.storage import Landscape
+from tdf_jax.viewer import handles, solving
+from tdf_jax.viewer.solving import Found, Problem
+from tdf_jax.viewer.worker import Worker
+from tdf_jax.viz.imitation_page import above
+from tdf_jax.viz.landscapes import LEVELS, SURFACES, isosurface
+from tdf_jax.viz.motion import motion_of
+from tdf_jax.viz.scene3d import VIEW
+from tdf_jax.viz.style import CLOUD, COLOURS, INK, TRUTH
+
+STEP = 0.1  # of the time slider, poses
+POSES_A_SECOND = 2.0
+RATE = 20.0  # frames a second
+BESIDE, OVER, HIDDEN = "beside", "over it", "hidden"
+FIELD_OF_VIEW = 45.0  # degrees
+BOX, SURFACE, PROBE = COLOURS(0.35), "#7aa6c2", "#f4845f"
+REACH = 0.006  # metres from the ray of a click within which a point is hit
+SHOWN_MODES = 12
+GRIP = 0.5  # length of the arrows at the object, in its diagonal
+CELL = 0.05  # metres, cells of the floor
+
+
+class Stage:
+    """An imitation on the screen.
+
+    Args:
+        server: the `viser.ViserServer`.
+        problem: the imitation, ready to be solved again.
+        landscape: energies to show with it; None if there are none.
+    """
+
+    def __init__(self, server: Any, problem: Problem, landscape: Landscape | None = None):
+        self.server, self.problem = server, problem
+        self.found = solving.chosen(problem, 0)
+        self.worker = Worker(self._say)
+        self._lock = threading.RLock()
+        self._playing: threading.Event | None = None
+        self._centroid = np.asarray(problem.points, float).mean(axis=0)
+        self._draw()
+        self._panel(landscape)
+        self._show(self.found)
+        self.worker.ask("surface", self._add_surface)
+        self.worker.ask("prepare", self._prepare)
+
+    def close(self) -> None:
+        """Stop what runs beside the server."""
+        self._stop()
+        self.worker.close()
+
+    # What is drawn
+
+    def _draw(self) -> None:
+        scene, server = self.problem.scene, self.server
+        demonstration = scene.demonstration
+        self._object = server.scene.add_frame("/imitation/object", show_axes=False)
+        self._nodes = {
+            "cloud": [handles.add_cloud(server, "/imitation/object/cloud", scene.points, COLOURS(0.0))],
+            "mesh": [handles.add_mesh(server, "/imitation/object/mesh", scene.meshes[1])],
+        }
+        self._path = handles.add_path(server, "/imitation/path", self.found.path[:, 4:], INK)
+        self._box = handles.add_box(server, "/imitation/box", demonstration.query, BOX, 1.6 * handles.LINE)
+        self._boxes = [
+            handles.add_box(
+                server,
+                f"/imitation/boxes/{index}",
+                demonstration.query,
+                COLOURS(index / max(1, len(self.found.path) - 1)),
+                0.5 * handles.LINE,
+            )
+            for index in range(len(self.found.path))
+        ]
+        self._nodes["boxes along the path"] = list(self._boxes)
+        self._draw_picks()
+        if scene.expected is not None:
+            truth = np.asarray(scene.expected.wxyz_xyz)
+            name = "/imitation/object/truth"  # it is a place on the object, and moves with it
+            box = handles.add_box(server, name, demonstration.query, TRUTH, 0.7 * handles.LINE)
+            handles.place(box, *np.split(truth[scene.result.grasp], [4]))
+            self._nodes["true pick"] = [box]
+        target = scene.target_points
+        if target is None and demonstration.target is not None:
+            target = demonstration.target.points
+        if target is not None:
+            self._nodes["target"] = [handles.add_cloud(server, "/imitation/target", np.asarray(target), CLOUD)]
+        self._draw_demonstration()
+        self._probe = handles.add_box(server, "/imitation/probe", demonstration.query, PROBE)
+        self._probe.visible = False
+        self._grip = server.scene.add_transform_controls(
+            "/imitation/drag_object", scale=GRIP * self._size(), line_width=3.0, depth_test=False
+        )
+        self._grip.position = self._centroid
+        self._goal = server.scene.add_transform_controls(
+            "/imitation/drag_goal", scale=0.7 * GRIP * self._size(), line_width=3.0, depth_test=False
+        )
+        self._grip.on_update(lambda event: self._drag_object(event.target))
+        self._goal.on_update(lambda event: self._drag_goal(event.target))
+        self._look()
+
+    def _draw_picks(self) -> None:
+        modes = self.problem.modes[:SHOWN_MODES]
+        low, high = modes[0].energy, modes[-1].energy
+        nodes = []
+        for number, mode in enumerate(modes[1:], 1):
+            colour = tuple(part / 255 for part in handles.energy_colour(mode.energy, low, high))
+            query = self.problem.scene.demonstration.query
+            node = handles.add_box(self.server, f"/imitation/object/picks/{number}", query, colour, 0.7 * handles.LINE)
+            handles.place(node, mode.pose[:4], mode.pose[4:])
+            nodes.append(node)
+        self._nodes["other picks"] = nodes
+
+    def _draw_demonstration(self) -> None:
+        scene, server = self.problem.scene, self.server
+        demonstration = scene.demonstration
+        self._shown = server.scene.add_frame("/demonstration", show_axes=False)
+        self._shown_object = server.scene.add_frame("/demonstration/object", show_axes=False)
+        cloud = handles.add_cloud(server, "/demonstration/object/cloud", np.asarray(demonstration.points), CLOUD)
+        self._nodes["cloud"].append(cloud)
+        self._nodes["mesh"].append(handles.add_mesh(server, "/demonstration/object/mesh", scene.meshes[0]))
+        handles.add_path(server, "/demonstration/path", np.asarray(demonstration.trajectory.translations), CLOUD)
+        self._shown_box = handles.add_box(server, "/demonstration/box", demonstration.query, BOX, handles.LINE)
+        if demonstration.target is not None:
+            node = handles.add_cloud(server, "/demonstration/target", np.asarray(demonstration.target.points), CLOUD)
+            self._nodes["target"].append(node)
+        points = np.asarray(demonstration.points, float)
+        below = np.array([*points.mean(axis=0)[:2], points[:, 2].min() - 0.02])
+        server.scene.add_label("/demonstration/name", "demonstration", position=below)
+
+    def _size(self) -> float:
+        return float(np.linalg.norm(np.ptp(self.problem.points, axis=0)))
+
+    def _contents(self) -> np.ndarray:
+        return np.concatenate([self.problem.points, self.found.path[:, 4:]])
+
+    def _look(self) -> None:
+        """Place the demonstration to the left of the imitation, and the camera before both."""
+        azimuth = np.radians(VIEW["azim"])
+        right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        demonstration = self.problem.scene.demonstration
+        shown = np.concatenate([np.asarray(demonstration.points), np.asarray(demonstration.trajectory.translations)])
+        contents = self._contents()
+        gap = 0.3 * self._size()
+        self._beside = right * ((contents @ right).min() - (shown @ right).max() - gap)
+        self._beside = self._beside + [0, 0, contents[:, 2].min() - shown[:, 2].min()]
+        look(self.server, np.concatenate([contents, shown + self._beside]))
+
+    def _add_surface(self) -> None:
+        try:
+            triangles = solving.reconstructed(self.problem)
+        except InputError as error:  # libigl is an extra
+            self._surface_box.hint = str(error)
+            return
+        if not len(triangles):
+            return
+        node = handles.add_triangles(self.server, "/imitation/object/surface", triangles, SURFACE, 0.85)
+        node.visible = self._surface_box.value
+        self._nodes["reconstructed surface"] = [node]
+        self._surface_box.disabled = False
+
+    def _prepare(self) -> None:
+        """Compile what a drag needs, so that the first answers as fast as the others."""
+        last = self.found
+        solving.dragged(self.problem, last.motion, last)
+        solving.regoaled(self.problem, last.goal, last)
+        solving.energy_at(self.problem, last, last.pick)
+        self._say("Ready: drag the object or its goal.")
+
+    # The panel
+
+    def _panel(self, landscape: Landscape | None) -> None:
+        gui, result = self.server.gui, self.problem.scene.result
+        gui.configure_theme(show_logo=False, show_share_button=False)
+        gui.main_panel.dock_right()  # beside the scene, not over it
+        gui.set_panel_label("tdf view")
+        self._summary = gui.add_markdown("")
+        self._status = gui.add_markdown("Preparing the solver ...")
+        with gui.add_folder("Time"):
+            last = len(self.found.path) - 1
+            self._time = gui.add_slider("pose", 0.0, max(float(last), STEP), STEP, float(result.grasp))
+            self._play = gui.add_button("Play")
+        self._time.on_update(lambda _: self._show_time())
+        self._play.on_click(lambda _: self._stop() if self._playing else self._start())
+        with gui.add_folder("Picks"):
+            modes = self.problem.modes[:SHOWN_MODES]
+            names = [f"{number}: energy {mode.energy:.4f}" for number, mode in enumerate(modes, 1)]
+            self._choice = gui.add_dropdown("shown", names, initial_value=names[0])
+            gui.add_markdown(_table(self.problem))
+        self._choice.on_update(lambda event: self._choose(names.index(event.target.value)))
+        with gui.add_folder("Move"):
+            self._move_object = gui.add_checkbox("object", True, hint="Drag its arrows, arcs or squares")
+            self._move_goal = gui.add_checkbox("goal", True, hint="The path follows while you drag")
+            self._reset = gui.add_button("Back to the result")
+            self._click = gui.add_checkbox("click a point: energy there", False)
+            self._energy = gui.add_markdown("")
+        self._move_object.on_update(lambda event: setattr(self._grip, "visible", event.target.value))
+        self._move_goal.on_update(lambda event: setattr(self._goal, "visible", event.target.value))
+        self._reset.on_click(lambda _: self._choose(names.index(self._choice.value)))
+        self._click.on_update(lambda event: setattr(self._probe, "visible", False))
+        self.server.scene.on_click()(self._clicked)
+        with gui.add_folder("Show"):
+            for name, nodes in self._nodes.items():
+                if any(node is not None for node in nodes):
+                    self._add_switch(name, name != "cloud" or not any(self._nodes["mesh"]))
+            self._surface_box = gui.add_checkbox("reconstructed surface", False, disabled=True)
+            self._surface_box.on_update(lambda event: self._set_visible("reconstructed surface", event.target.value))
+            where = gui.add_dropdown("demonstration", (BESIDE, OVER, HIDDEN), initial_value=BESIDE)
+        where.on_update(lambda event: self._put_demonstration(event.target.value))
+        self._put_demonstration(BESIDE)
+        if landscape is not None:
+            show_landscape(self.server, landscape)
+
+    def _add_switch(self, name: str, value: bool) -> None:
+        switch = self.server.gui.add_checkbox(name, value)
+        self._set_visible(name, value)
+        switch.on_update(lambda event: self._set_visible(name, event.target.value))
+
+    def _set_visible(self, name: str, value: bool) -> None:
+        for node in self._nodes.get(name, ()):
+            if node is not None:
+                node.visible = value
+
+    def _put_demonstration(self, where: str) -> None:
+        self._shown.visible = where != HIDDEN
+        self._shown.position = self._beside if where == BESIDE else np.zeros(3)
+
+    def _say(self, text: str) -> None:
+        self._status.content = text
+
+    # What the mouse does
+
+    def _drag_object(self, grip: Any) -> None:
+        R = Rotation.from_quat(np.asarray(grip.wxyz), scalar_first=True).as_matrix()
+        motion = np.concatenate([grip.wxyz, np.asarray(grip.position) - R @ self._centroid])
+        with self._lock:
+            self._stop()
+            handles.place(self._object, motion[:4], motion[4:])
+        self.worker.ask("solve", lambda: self._solve(motion))
+
+    def _solve(self, motion: Float[np.ndarray, "7"]) -> None:
+        began = time.perf_counter()
+        found = solving.dragged(self.problem, motion, self.found)
+        self._show(found)
+        encoding, search = found.seconds or (0.0, 0.0)
+        self._say(f"Solved in {time.perf_counter() - began:.2f} s: encoding {encoding:.2f} s, search {search:.2f} s.")
+
+    def _drag_goal(self, grip: Any) -> None:
+        goal = np.concatenate([grip.wxyz, grip.position])
+
+        def move():
+            began = time.perf_counter()
+            self._show(solving.regoaled(self.problem, goal, self.found), goal=False)
+            self._say(f"The path follows the goal, in {time.perf_counter() - began:.3f} s.")
+
+        self.worker.ask("goal", move)
+
+    def _choose(self, number: int) -> None:
+        self._stop()
+        self._grip.wxyz, self._grip.position = np.array([1.0, 0, 0, 0]), self._centroid
+        self._time.value = float(self.problem.scene.result.grasp)
+        self.worker.ask("choose", lambda: self._show(solving.chosen(self.problem, number)))
+
+    def _clicked(self, event: Any) -> None:
+        if not self._click.value:
+            return
+        motion = jnp.asarray(self.found.motion, jnp.float32)
+        points = np.asarray(se3.transform(motion, jnp.asarray(self.problem.points, jnp.float32)))
+        point = solving.point_under(points, np.array(event.ray_origin), np.array(event.ray_direction), REACH)
+        if point is None:
+            self._energy.content = "No point of the object's cloud is there."
+            return
+        self.worker.ask("probe", lambda: self._show_energy(point))
+
+    def _show_energy(self, point: Float[np.ndarray, "3"]) -> None:
+        """Place the box of query points with its middle at a point, in the orientation of the pick."""
+        pick = self.found.pick
+        R = Rotation.from_quat(pick[:4], scalar_first=True).as_matrix()
+        middle = np.asarray(self.problem.reference.query, float).mean(axis=0)
+        pose = np.concatenate([pick[:4], point - R @ middle])
+        energy = solving.energy_at(self.problem, self.found, pose)
+        handles.place(self._probe, pose[:4], pose[4:])
+        self._probe.visible = True
+        away = np.linalg.norm(pose[4:] - pick[4:])
+        times = f", {energy / self.found.energy:.1f} times that of the pick" if self.found.energy > 0 else ""
+        self._energy.content = (
+            f"Energy **{energy:.4f}** there{times}: {100 * away:.1f} cm from the pick, in its orientation."
+        )
+
+    # What changes
+
+    def _show(self, found: Found, goal: bool = True) -> None:
+        with self._lock, self.server.atomic():
+            self.found = found
+            self._path.points = handles.path_segments(found.path[:, 4:]).astype(np.float32)
+            for node, pose in zip(self._boxes, found.path):
+                handles.place(node, pose[:4], pose[4:])
+            if goal:
+                handles.place(self._goal, found.goal[:4], found.goal[4:])
+            self._summary.content = _words(found)
+            self._show_time()
+
+    def _show_time(self) -> None:
+        result, demonstration = self.problem.scene.result, self.problem.scene.demonstration
+        index = np.array([min(float(self._time.value), len(self.found.path) - 1.0)])
+        with self._lock, self.server.atomic():
+            motion = motion_of(self.found.path, result.grasp, result.release, index)
+            self._put(self._box, motion.rotations[0], motion.translations[0])
+            R = Rotation.from_quat(self.found.motion[:4], scalar_first=True).as_matrix()
+            held = motion.object_rotations[0]
+            self._put(self._object, held @ R, held @ self.found.motion[4:] + motion.object_translations[0])
+            shown = np.asarray(demonstration.trajectory.wxyz_xyz)
+            share = index * (len(shown) - 1) / max(1, len(self.found.path) - 1)
+            motion = motion_of(shown, demonstration.grasp, demonstration.release, share)
+            self._put(self._shown_box, motion.rotations[0], motion.translations[0])
+            self._put(self._shown_object, motion.object_rotations[0], motion.object_translations[0])
+
+    def _put(self, node: Any, R: np.ndarray, t: np.ndarray) -> None:
+        handles.place(node, Rotation.from_matrix(R).as_quat(scalar_first=True), t)
+
+    def _start(self) -> None:
+        self._playing = stop = threading.Event()
+        self._play.label = "Pause"
+        last = len(self.found.path) - 1
+        if self._time.value >= last - STEP / 2:
+            self._time.value = 0.0
+
+        def run():
+            began, first = time.monotonic(), self._time.value
+            while not stop.wait(1 / RATE):
+                place = first + POSES_A_SECOND * (time.monotonic() - began)
+                self._time.value = min(float(last), round(place / STEP) * STEP)
+                if place >= last:
+                    self._stop()
+
+        threading.Thread(target=run, daemon=True).start()
+
+    def _stop(self) -> None:
+        playing, self._playing = self._playing, None
+        if playing is not None:
+            playing.set()
+            self._play.label = "Play"
+
+
+def look(server: Any, contents: Float[np.ndarray, "points 3"]) -> None:
+    """Place the camera before what is shown, as in the pictures, and a floor of 5 cm cells under it.
+
+    Args:
+        server: the `viser.ViserServer`.
+        contents: points of all that is shown, (points, 3), metres, world frame.
+    """
+    azimuth, height = np.radians(VIEW["azim"]), np.radians(VIEW["elev"])
+    towards = np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
+    low, high = contents.min(axis=0), contents.max(axis=0)
+    middle, size = (low + high) / 2, high - low
+    distance = 0.58 * np.linalg.norm(size) / np.tan(np.radians(FIELD_OF_VIEW) / 2)
+    server.scene.set_up_direction("+z")
+    camera = server.initial_camera
+    camera.position, camera.look_at = middle + distance * towards, middle
+    camera.fov, camera.near = np.radians(FIELD_OF_VIEW), 0.005
+    cells = np.ceil((size[:2] + 4 * CELL) / CELL) * CELL
+    server.scene.add_grid(
+        "/floor",
+        width=cells[0],
+        height=cells[1],
+        plane="xy",
+        cell_size=CELL,
+        section_size=2 * CELL,
+        cell_color=(225, 225, 225),
+        section_color=(205, 205, 205),
+        position=(middle[0], middle[1], low[2] - CELL),
+    )
+    words = f"cells of {100 * CELL:g} cm"
+    near = (middle[0] + 0.25 * cells[0], middle[1] - 0.25 * cells[1], low[2] - CELL)
+    server.scene.add_label("/floor_name", words, position=near)
+
+
+def show_landscape(server: Any, landscape: Landscape) -> None:
+    """Add an energy landscape: a plane, or the slices and the surfaces of a volume, with its waypoints and minimisers.
+
+    Args:
+        server: the `viser.ViserServer`.
+        landscape: landscape of a grid with two or three axes, in one orientation or the best of several.
+    """
+    energy, points, gui = landscape.combined, landscape.grid.points, server.gui
+    if energy.ndim not in (2, 3) or energy.shape != landscape.grid.shape:
+        raise InputError(
+            f"tdf view: the landscape has energies {energy.shape}; expected a grid with two or three axes in one "
+            "orientation, or the best of several"
+        )
+    low, high = float(np.nanmin(energy)), float(np.nanmax(energy))
+    marks = [
+        handles.add_path(server, "/landscape/waypoints", landscape.waypoints, "#e9c46a"),
+        handles.add_cloud(server, "/landscape/minimisers", landscape.minimisers, TRUTH),
+    ]
+    marks[1].point_size = 0.008
+    nodes: dict[str, Any] = {}
+
+    def slice_at(number: int) -> None:
+        nodes["slice"] = handles.add_map(server, "/landscape/slice", points[..., number, :], energy[..., number])
+
+    with gui.add_folder("Landscape"):
+        gui.add_markdown(f"Energy from {low:.4f} (dark) to {high:.4f} (light); red: minimum of each waypoint.")
+        if energy.ndim == 2:
+            nodes["slice"] = handles.add_map(server, "/landscape/slice", points, energy)
+        else:
+            count = energy.shape[2]
+            chosen = gui.add_slider("slice", 0, count - 1, 1, count // 2)
+            chosen.on_update(lambda event: slice_at(int(event.target.value)))
+            slice_at(count // 2)
+            for share, colour in zip(LEVELS, SURFACES):
+                try:
+                    triangles = isosurface(landscape, share)
+                except InputError:  # libigl is an extra
+                    break
+                node = handles.add_triangles(server, f"/landscape/surface{share}", triangles, colour, 0.35)
+                _switch(gui, f"surface of the least {100 * share:.0f} %", node)
+        shown = gui.add_checkbox("plane", True)
+        shown.on_update(lambda event: setattr(nodes["slice"], "visible", event.target.value))
+
+
+def _switch(gui: Any, name: str, node: Any) -> None:
+    box = gui.add_checkbox(name, True)
+    box.on_update(lambda event: setattr(node, "visible", event.target.value))
+
+
+def _words(found: Found) -> str:
+    """The pick in a few lines."""
+    x, y, z = 100 * np.asarray(found.pick[4:], float)
+    lines = [f"**Pick** x {x:.1f}, y {y:.1f}, z {z:.1f} cm", f"**Energy** {found.energy:.5f}"]
+    if np.isfinite(found.confidence):
+        lines.append(f"**Confidence** {found.confidence:.2f} that it is right to 2 cm and 20°")
+    return "  \n".join(lines)
+
+
+def _table(problem: Problem) -> str:
+    """The distinct picks by rising energy."""
+    modes = problem.modes
+    rows = ["| pick | energy | above the best |", "|---|---|---|"]
+    for number, mode in enumerate(modes[:SHOWN_MODES], 1):
+        rows.append(
+            f"| {number} | {mode.energy:.5f} | {'' if number == 1 else above(mode, modes[0]).split(' above')[0]} |"
+        )
+    words = f"{len(modes)} distinct of {len(problem.scene.result.energies)} candidates; dark boxes have low energies."
+    return "\n".join([*rows, "", words])

@@ -1,0 +1,70 @@
+"""`tdf view`: what it opens, and what it refuses."""
+
+import threading
+
+import jax
+import numpy as np
+import pytest
+from conftest import CARRY, random_cloud
+
+import tdf_jax as tdf
+from tdf_jax.cli.main import main
+from tdf_jax.geometry.grid import plane_grid
+from tdf_jax.landscape.storage import Landscape
+from tdf_jax.solvers.imitation_scene import SCENE, weights_of
+
+pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
+
+
+@pytest.fixture
+def folder(demonstration, weights, tmp_path):
+    model, cloud = tdf.load_model(weights), random_cloud(3).astype(np.float32)
+    result = tdf.imitate(model, demonstration, cloud, key=jax.random.key(0), config=CARRY, clean=False)
+    (tmp_path / "out").mkdir()
+    scene = tdf.ImitationScene(demonstration, cloud, result, weights=weights_of(str(weights), model))
+    tdf.save_imitation(tmp_path / "out" / SCENE, scene)
+    return tmp_path / "out"
+
+
+@pytest.fixture
+def landscape(tmp_path):
+    grid = plane_grid(0.1, 4)
+    values = np.linalg.norm(grid.points, axis=-1)[None]
+    (tmp_path / "land").mkdir()
+    found = Landscape(grid, values, np.zeros((1, 3)), np.eye(3)[None], np.zeros(values.shape, np.int32))
+    tdf.save_landscape(tmp_path / "land" / "landscape.npz", found)
+    return tmp_path / "land"
+
+
+def refusal(capsys, *words):
+    with pytest.raises(SystemExit) as stop:
+        main(["view", *map(str, words), "--no-browser", "--port", "0"])
+    assert stop.value.code == 2
+    return capsys.readouterr().err
+
+
+@pytest.mark.parametrize("what", ["imitation", "both", "landscape"])
+def test_a_folder_is_shown_until_ctrl_c(folder, landscape, what, monkeypatch, capsys):
+    def interrupted(self, timeout=None):
+        raise KeyboardInterrupt
+
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    monkeypatch.setattr("tdf_jax.cli.view.Waiting.wait", interrupted)
+    words = {"imitation": [folder], "both": [folder, "--landscape", landscape], "landscape": [landscape]}[what]
+    with pytest.raises(SystemExit) as stop:
+        main(["view", *map(str, words), "--port", "0"])
+    assert stop.value.code == 130
+    out = capsys.readouterr().out
+    assert out.startswith("http://127.0.0.1:") and out.count("\n") == 1
+    assert opened == [out.split()[0]]
+    assert not [thread for thread in threading.enumerate() if "Worker" in thread.name]
+
+
+def test_what_is_no_result_is_refused(folder, landscape, weights, tmp_path, capsys):
+    assert "there is no folder" in refusal(capsys, tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    assert "it is empty" in refusal(capsys, tmp_path / "empty")
+    assert "there is no file" in refusal(capsys, folder, "--landscape", tmp_path / "empty")
+    assert "is a landscape, and there is --landscape" in refusal(capsys, landscape, "--landscape", landscape)
+    assert "are not those that the imitation was made with" in refusal(capsys, folder, "--weights", "bowl")

@@ -1,0 +1,182 @@
+"""The viewer: what it shows and does without a browser, and with one, by a mouse."""
+
+import time
+
+import jax
+import numpy as np
+import pytest
+from conftest import CARRY, colours_of, random_cloud
+from scipy.spatial.transform import Rotation
+
+import tdf_jax as tdf
+from tdf_jax.geometry.grid import plane_grid, volume_grid
+from tdf_jax.landscape.storage import Landscape
+from tdf_jax.viewer import solving, stage
+from tdf_jax.viewer.local_server import address, serving
+
+pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
+SECONDS = 120  # that the slowest machine may take
+
+
+@pytest.fixture(scope="module")
+def problem(demonstration, small_model):
+    cloud = random_cloud(3).astype(np.float32)
+    result = tdf.imitate(small_model, demonstration, cloud, key=jax.random.key(0), config=CARRY, clean=False)
+    scene = tdf.ImitationScene(demonstration, cloud, result, expected=result.trajectory)
+    return solving.problem_of(scene, small_model)
+
+
+@pytest.fixture
+def shown(problem):
+    with serving("test", 0) as server:
+        one = stage.Stage(server, problem)
+        assert one.worker.wait(SECONDS)
+        yield one
+        one.close()
+
+
+def bowl(grid):
+    values = 0.002 + np.linalg.norm(grid.points, axis=-1)[None]
+    return Landscape(grid, values, np.zeros((1, 3)), np.eye(3)[None], np.zeros(values.shape, np.int32))
+
+
+def drag(shown, grip, xyz):
+    """What viser does when a handle was dragged."""
+    grip.position = np.asarray(xyz, float)
+    for call in grip._impl_aux.update_cb:
+        call(type("Event", (), {"target": grip, "phase": "update", "client": None, "client_id": None})())
+    assert shown.worker.wait(SECONDS)
+
+
+def test_the_panel_lists_every_distinct_pick_with_how_much_worse_it_is(shown, problem):
+    table = stage._table(problem)
+    for number, mode in enumerate(problem.modes, 1):
+        assert f"| {number} | {mode.energy:.5f} |" in table
+    if len(problem.modes) > 1:
+        assert f"{problem.modes[1].energy / problem.modes[0].energy - 1:.0%}".replace("%", " %") in table
+    assert f"{len(problem.modes)} distinct of {len(problem.scene.result.energies)} candidates" in table
+    assert shown._status.content.startswith("Ready")
+
+
+def test_an_object_that_is_dragged_is_solved_again(shown, problem):
+    before = shown.found
+    drag(shown, shown._grip, shown._centroid + [0, 0, 0.05])
+    np.testing.assert_allclose(shown.found.motion, [1, 0, 0, 0, 0, 0, 0.05], atol=1e-9)
+    assert shown.found.energy <= before.energy * 1.05  # the field moves with its cloud
+    assert np.linalg.norm(shown.found.pick[4:] - before.pick[4:]) > 0.01
+    assert "Solved in" in shown._status.content and "encoding" in shown._status.content
+    x, y, z = 100 * shown.found.pick[4:]
+    assert f"x {x:.1f}, y {y:.1f}, z {z:.1f} cm" in shown._summary.content
+    np.testing.assert_allclose(shown._path.points[0, 0], shown.found.path[0, 4:], atol=1e-6)
+
+
+def test_a_goal_that_is_dragged_takes_the_path_along(shown):
+    before = shown.found
+    drag(shown, shown._goal, before.goal[4:] + [0.1, 0, 0])
+    np.testing.assert_allclose(shown.found.path[-1, 4:], before.goal[4:] + [0.1, 0, 0], atol=1e-5)
+    np.testing.assert_array_equal(shown.found.pick, before.pick)
+    np.testing.assert_allclose(shown._boxes[-1].position, shown.found.path[-1, 4:], atol=1e-6)
+
+
+def test_the_object_is_carried_between_grasp_and_release(shown):
+    shown._time.value = float(len(shown.found.path) - 1)
+    shown._show_time()
+    motion = np.asarray(shown.problem.scene.result.object_motion)
+    np.testing.assert_allclose(shown._object.position, motion[4:], atol=1e-5)
+    np.testing.assert_allclose(abs(shown._object.wxyz @ motion[:4]), 1, atol=1e-6)
+    np.testing.assert_allclose(shown._box.position, shown.found.path[-1, 4:], atol=1e-6)
+
+
+def test_playing_ends_at_the_last_pose(shown, monkeypatch):
+    monkeypatch.setattr(stage, "POSES_A_SECOND", 30.0)
+    shown._start()
+    assert shown._play.label == "Pause"
+    until = time.monotonic() + SECONDS
+    while shown._playing and time.monotonic() < until:
+        time.sleep(0.01)
+    assert shown._play.label == "Play" and shown._time.value == len(shown.found.path) - 1
+
+
+def test_an_energy_is_shown_at_the_point_that_is_clicked(shown, problem):
+    point = np.asarray(problem.points[7], float)
+    event = type("Event", (), {"ray_origin": point + [0, 0, 1e-3], "ray_direction": (0.0, 0.0, -1.0)})()
+    shown._clicked(event)  # not ticked
+    assert shown._energy.content == "" and not shown._probe.visible
+    shown._click.value = True
+    shown._clicked(event)
+    assert shown.worker.wait(SECONDS)
+    R = Rotation.from_quat(shown._probe.wxyz, scalar_first=True)
+    middle = R.apply(np.asarray(problem.reference.query).mean(axis=0)) + shown._probe.position
+    np.testing.assert_allclose(middle, point, atol=1e-6)
+    pose = np.concatenate([shown._probe.wxyz, shown._probe.position])
+    assert f"**{solving.energy_at(problem, shown.found, pose):.4f}**" in shown._energy.content
+    shown._clicked(type("Event", (), {"ray_origin": (9.0, 9, 9), "ray_direction": (0.0, 0.0, 1.0)})())
+    assert shown._energy.content == "No point of the object's cloud is there."
+
+
+def test_another_pick_is_shown_and_the_result_comes_back(shown, problem):
+    drag(shown, shown._grip, shown._centroid + [0, 0, 0.05])
+    number = len(problem.modes) - 1
+    shown._choose(number)
+    assert shown.worker.wait(SECONDS)
+    np.testing.assert_array_equal(shown.found.pick, problem.modes[number].pose)
+    np.testing.assert_array_equal(shown._grip.position, shown._centroid)
+    np.testing.assert_array_equal(shown.found.motion, solving.IDENTITY)
+
+
+@pytest.mark.parametrize("grid", [plane_grid(0.2, 4), volume_grid(0.2, 4)], ids=["plane", "volume"])
+def test_a_landscape_is_shown_in_slices(grid):
+    with serving("test", 0) as server:
+        stage.show_landscape(server, bowl(grid))
+        names = set(server.scene._handle_from_node_name)
+        assert {"/landscape/slice", "/landscape/waypoints", "/landscape/minimisers"} <= names
+        each = bowl(grid)
+        object.__setattr__(each, "values", each.values[:, None])
+        object.__setattr__(each, "turned", None)
+        with pytest.raises(tdf.InputError, match="expected a grid with two or three axes in one orientation"):
+            stage.show_landscape(server, each)
+
+
+@pytest.mark.slow
+def test_a_real_mouse_drags_the_object_in_a_browser_and_the_pick_changes(shown, browser):
+    tab = browser.new_page(viewport={"width": 1000, "height": 700})
+    received = [0]
+    tab.on(
+        "websocket",
+        lambda socket: socket.on("framereceived", lambda data: received.__setitem__(0, received[0] + len(data))),
+    )
+    tab.goto(address(shown.server))
+    tab.wait_for_selector("canvas", timeout=1000 * SECONDS)
+    tab.wait_for_selector("text=Ready", timeout=1000 * SECONDS)
+    tab.wait_for_timeout(3000)
+    before, text = tab.screenshot(), tab.inner_text("body")
+    assert colours_of(before) > 300 and received[0] < 10_000_000
+    x, y, z = 100 * shown.found.pick[4:]
+    assert f"x {x:.1f}, y {y:.1f}, z {z:.1f} cm" in text
+    pick = shown.found.pick
+    arrow = shown._grip.position + [0, 0, 0.75 * stage.GRIP * shown._size()]  # on the arrow that points up
+    begin, end = on_screen(shown, arrow), on_screen(shown, arrow + [0, 0, 0.06])
+    tab.mouse.move(*begin)
+    tab.mouse.down()
+    tab.mouse.move(*end, steps=8)
+    tab.mouse.up()
+    tab.wait_for_selector("text=Solved in", timeout=1000 * SECONDS)
+    assert shown.worker.wait(SECONDS)
+    np.testing.assert_allclose(shown.found.motion[4:6], 0, atol=1e-6)
+    assert 0.02 < shown.found.motion[6] < 0.15
+    assert np.linalg.norm(shown.found.pick[4:] - pick[4:]) > 0.01
+    tab.wait_for_timeout(1000)
+    x, y, z = 100 * shown.found.pick[4:]
+    assert f"x {x:.1f}, y {y:.1f}, z {z:.1f} cm" in tab.inner_text("body")
+    assert tab.screenshot() != before
+    tab.close()
+
+
+def on_screen(shown, xyz):
+    """Where a point of the world is in the browser, pixels."""
+    (client,) = shown.server.get_clients().values()
+    camera = client.camera
+    R = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
+    x, y, z = R.T @ (np.asarray(xyz) - camera.position)
+    scale = camera.image_height / 2 / np.tan(camera.fov / 2)
+    return camera.image_width / 2 + scale * x / z, camera.image_height / 2 + scale * y / z
