@@ -19,7 +19,7 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file, replace_folder
 from tdf_jax.cli.camera import choose, read_scene, table as cluster_table
 from tdf_jax.cli.options import Settings, make_scene, resolved
-from tdf_jax.cli.pictures import Pictures, check_page
+from tdf_jax.cli.pictures import Pictures, check_animation, check_page
 from tdf_jax.cli.tasks import TaskScene, make_task, not_judged
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import describe
@@ -68,6 +68,8 @@ def _run(settings: Settings, folder: Path, pictures: Pictures) -> dict:
     began = time.perf_counter()
     if settings.page:
         check_page("tdf imitate")
+    if settings.animation is not None:
+        check_animation("tdf imitate", settings.animation)
     query_key, start_key = jax.random.split(jax.random.fold_in(jax.random.key(settings.seed), STREAM))
     with _timed(seconds, "load"):
         config = _config(settings)
@@ -136,6 +138,12 @@ def _run(settings: Settings, folder: Path, pictures: Pictures) -> dict:
             from tdf_jax.viz.imitation_page import save_imitation_page
 
             save_imitation_page(path, shown, title)
+    if settings.animation is not None:
+        with _timed(seconds, "animation"), pictures.drawing(settings.animation) as path:
+            from tdf_jax.sim.recording import save_film
+            from tdf_jax.viz.film import RATE, film_frames
+
+            save_film(path, list(film_frames(shown)), RATE)
     seconds["total"] = time.perf_counter() - began
     record = _record(settings, model, scene, energy, config, result, relation, camera, seconds)
     replace_file("tdf imitate", folder / RESULT, json.dumps(record, indent=1).encode())

@@ -49,6 +49,7 @@ DEPRECATED_FLAGS = {
     "evaluate": {"--inits": "--num-starts", "--poses": "--num-poses"},
     "benchmark": {"--inits": "--num-starts", "--poses": "--num-poses"},
     "reproduce": {"--inits": "--num-starts", "--poses": "--num-poses", "--lever": "--rotation-scale"},
+    "simulate": {"--video": "--animation"},
     "train": {"--poses": "--num-poses", "--network.asymmetry": "--network.symmetry-breaking-offset"},
 }
 # Choices of the release before by command and option; they are accepted for one release, with a warning.

@@ -108,6 +108,7 @@ class Settings(SceneSettings):
         iterations: number of Adam's steps.
         out: folder of the results; an earlier result there is replaced.
         no_plots: write no imitation.png and loss.png.
+        animation: film of the imitation, a .gif or .mp4 file.
         page: write imitation.html, to turn and play in a browser without a network; needs the extra "pages".
         json: print result.json instead of the table.
     """
@@ -133,6 +134,7 @@ class Settings(SceneSettings):
     iterations: Annotated[int | None, _option("INT", "100")] = None
     out: Annotated[Path, _option("DIR")] = Path("imitation")
     no_plots: bool = False
+    animation: Annotated[Path | None, _option("FILE", "none")] = None
     page: bool = False
     json: bool = False
 

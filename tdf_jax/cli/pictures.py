@@ -4,6 +4,8 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
+from tdf_jax._internal.errors import InputError
+
 
 class PictureError(Exception):
     """Raised at the end of a command, when its results are complete but pictures are missing."""
@@ -64,3 +66,22 @@ def check_page(function: str) -> None:
         from tdf_jax.viz.page import pages
 
         pages(function)
+
+
+def check_animation(function: str, path: Path) -> None:
+    """Refuse --animation at once where it could not be written.
+
+    Args:
+        function: name that the message begins with.
+        path: the film.
+
+    Raises:
+        InputError: the ending is none of a film, the folder does not exist, or the encoder is not installed.
+    """
+    from tdf_jax.sim.recording import ENDINGS, check_encoder
+
+    if path.suffix.lower() not in ENDINGS:
+        raise InputError(f"{function}: --animation is {path}; expected a name that ends in {' or '.join(ENDINGS)}")
+    if path.is_dir() or not path.parent.is_dir():
+        raise InputError(f"{function}: --animation is {path}; expected a file in an existing folder")
+    check_encoder(path)

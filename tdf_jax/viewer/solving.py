@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +13,9 @@ from jaxtyping import Float
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.descriptors import pose_descriptor
-from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference, describe
 from tdf_jax.energy.residual import pick_residual
 from tdf_jax.geometry import se3
-from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.geometry.transport import carry_to_picks
 from tdf_jax.networks.checkpoint import load_model
 from tdf_jax.networks.encoding import encode
@@ -24,23 +23,14 @@ from tdf_jax.networks.field import DescriptorField
 from tdf_jax.networks.model import Model, fingerprint
 from tdf_jax.networks.surface import surface_triangles
 from tdf_jax.solvers.imitation_scene import ImitationScene
-from tdf_jax.solvers.multistart import SolveConfig, solve
+from tdf_jax.solvers.pick import carry
+from tdf_jax.solvers.result import Result
+from tdf_jax.solvers.tracking import track
 from tdf_jax.uncertainty.calibration import CALIBRATED, confidence
 from tdf_jax.uncertainty.modes import Mode, cluster_poses
 
 IDENTITY = np.array([1.0, 0, 0, 0, 0, 0, 0])
-# Three starts near the answer need few steps: the last pick, where the drag takes it, and half-way.
-NEAR = SolveConfig(
-    num_starts=3,
-    num_trajectory_starts=1,
-    num_candidates=1,
-    coarse_steps=6,
-    prune_steps=1,
-    search_steps=1,
-    propagate_steps=1,
-    refine_steps=4,
-    polish_steps=10,
-)
+STARTS = 0  # number that seeds the starts of `carry`, where `track` is lost
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -79,8 +69,10 @@ class Found:
         path: T_world_query of every pose, approach and retreat included, (poses, 7).
         energy: energy of the pick's descriptors (eq. 2 of one waypoint).
         motion: where the object was dragged to, `wxyz_xyz`: a point x of `Problem.points` is at M x.
+        result: result whose best candidate the pick is.
         confidence: probability that the pick is right, see `tdf_jax.confidence`; NaN where it is not calibrated.
         seconds: time of the encoding and of the search, seconds; None if nothing was searched.
+        tracked: whether `track` found the pick; otherwise `carry` did, from many starts.
     """
 
     pick: Float[np.ndarray, "7"]
@@ -88,8 +80,10 @@ class Found:
     path: Float[np.ndarray, "poses 7"]
     energy: float
     motion: Float[np.ndarray, "7"]
+    result: Result
     confidence: float = np.nan
     seconds: tuple[float, float] | None = None
+    tracked: bool = True
 
 
 def model_of(scene: ImitationScene, weights: str | None) -> Model:
@@ -154,7 +148,16 @@ def chosen(problem: Problem, number: int) -> Found:
     path = np.asarray(result.trajectories)[index]
     energy = float(problem.modes[number].energy)
     confident = float(result.confidence) if number == 0 else np.nan
-    return Found(path[result.grasp], path[result.release], path, energy, IDENTITY.copy(), confident)
+    one = [index]
+    alone = dataclasses.replace(
+        result,
+        trajectories=np.asarray(result.trajectories)[one],
+        energies=np.asarray(result.energies)[one],
+        candidate_history=np.asarray(result.candidate_history)[one],
+        # By which `track` knows whether it is lost: a worse pick has a higher one.
+        first_residual=np.asarray(result.first_residual) * np.float32(energy / problem.modes[0].energy),
+    )
+    return Found(path[result.grasp], path[result.release], path, energy, IDENTITY.copy(), alone, confident)
 
 
 def dragged(problem: Problem, motion: Float[np.ndarray, "7"], last: Found) -> Found:
@@ -172,29 +175,18 @@ def dragged(problem: Problem, motion: Float[np.ndarray, "7"], last: Found) -> Fo
     points = np.asarray(se3.transform(jnp.asarray(motion, jnp.float32), jnp.asarray(problem.points, jnp.float32)))
     field = jax.block_until_ready(encode(problem.model, points, clean=False))
     encoded = time.perf_counter()
-    step = se3.compose(jnp.asarray(motion), se3.inverse(jnp.asarray(last.motion)))
-    with_it = np.asarray(se3.compose(step, jnp.asarray(last.pick)))
-    starts = np.stack([last.pick, with_it, _between(last.pick, with_it)])[:, None]
-    reference = problem.reference
-    one = Reference(reference.descriptors[:1], Trajectory(reference.trajectory.wxyz_xyz[:1]), reference.query)
-    result = solve(
-        field,
-        one,
-        jax.random.key(0),
-        fix_last=False,
-        energy=EnergyWeights(0.0),
-        config=NEAR,
-        starts=starts.astype(np.float32),
-    )
+    result, tracked = _searched(field, problem.reference, last)
     pick = np.asarray(result.pick)
     energy = float(result.loss)
     goal = last.goal
     if problem.scene.demonstration.target is not None:
+        step = se3.compose(jnp.asarray(motion), se3.inverse(jnp.asarray(last.motion)))
         released = se3.compose(jnp.asarray(last.goal), se3.inverse(jnp.asarray(last.pick)))  # the object's motion
         goal = np.asarray(se3.compose(se3.compose(released, se3.inverse(step)), jnp.asarray(pick)))
     seconds = (encoded - began, time.perf_counter() - encoded)
     path = path_between(problem, pick, goal)
-    return Found(pick, goal, path, energy, np.asarray(motion), _confidence(problem, energy), seconds)
+    confident = _confidence(problem, energy)
+    return Found(pick, goal, path, energy, np.asarray(motion), result, confident, seconds, tracked)
 
 
 def regoaled(problem: Problem, goal: Float[np.ndarray, "7"], last: Found) -> Found:
@@ -284,15 +276,21 @@ def reconstructed(problem: Problem) -> Float[np.ndarray, "faces 3 3"]:
     return surface_triangles(problem.field, np.eye(4), bounds)
 
 
+def _searched(field: DescriptorField, reference: Reference, last: Found) -> tuple[Result, bool]:
+    """The pick by `track`, or by `carry` where that is lost or has nothing to begin with; and which of the two."""
+    ends: dict[str, Any] = {"goal": jnp.asarray(last.goal)}
+    if reference.trajectory.num_poses == 1:
+        ends = {"fix_last": False}
+    # Results of other methods, and of few query points, have no latent or no residual to begin with.
+    if last.result.latent.shape == field.latent.shape and np.isfinite(last.result.first_residual):
+        result = track(field, reference, last.result, **ends)
+        if not np.asarray(result.lost):
+            return result, True
+    return carry(field, reference, jax.random.key(STARTS), **ends), False
+
+
 def _confidence(problem: Problem, energy: float) -> float:
     if problem.model.info.name not in CALIBRATED:
         return np.nan
     probability = confidence(pick_residual(energy, problem.reference.descriptors[0]))
     return np.nan if probability is None else probability
-
-
-def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The pose half-way between two."""
-    pair = jnp.asarray(np.stack([a, b]), jnp.float32)
-    R = se3.geodesic(se3.rotation(pair[0]), se3.rotation(pair[1]), jnp.array([0.5]))
-    return np.asarray(se3.pose(R, pair[:, 4:].mean(axis=0)[None]))[0]

@@ -253,7 +253,9 @@ class Stage:
         found = solving.dragged(self.problem, motion, self.found)
         self._show(found)
         encoding, search = found.seconds or (0.0, 0.0)
-        self._say(f"Solved in {time.perf_counter() - began:.2f} s: encoding {encoding:.2f} s, search {search:.2f} s.")
+        how = "" if found.tracked else " The pick was lost, and is found by a search from many starts."
+        seconds = time.perf_counter() - began
+        self._say(f"Solved in {seconds:.2f} s: encoding {encoding:.2f} s, search {search:.2f} s.{how}")
 
     def _drag_goal(self, grip: Any) -> None:
         goal = np.concatenate([grip.wxyz, grip.position])

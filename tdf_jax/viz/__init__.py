@@ -6,6 +6,7 @@ Modules:
     cards: how objects show themselves in a notebook
     contact_sheet: many objects side by side
     evaluation: pictures of the benchmark
+    film: frames of a film of an imitation
     html: page of an energy landscape
     imitation: an imitation and its losses
     imitation_page: page of an imitation, which plays

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.axes3d import Axes3D
@@ -127,7 +127,7 @@ def candidates_panel(
     ax.add_collection3d(pieces.collection(), autolim=False)
     shown = np.concatenate(contents)
     frame(ax, shown, MARGIN * np.ptp(shown, axis=0))
-    colours = matplotlib.colors.ListedColormap(COLOURS(np.linspace(0, 0.9, 64)))
+    colours = ListedColormap(COLOURS(np.linspace(0, 0.9, 64)))
     bar = cast(Figure, ax.figure).colorbar(
         ScalarMappable(scale, colours), ax=ax, orientation="horizontal", shrink=0.6, pad=0.09, aspect=30
     )

@@ -137,6 +137,7 @@ def test_the_record_tells_all_settings(folder, weights):
         "goal_offset": [0.0, 0.0, 0.0], "k": None, "method": "adam", "num_starts": 3, "num_poses": 4, "queries": 8,
         "iterations": 3, "points": 60,
         "seed": 0, "weights": str(weights), "out": str(folder), "no_plots": False, "page": False, "json": False,
+        "animation": None,
         "depth": None, "intrinsics": None, "camera_pose": None, "mask": None, "workspace": None, "depth_scale": None,
         "clusters": False, "clean": True,
     }  # fmt: skip

@@ -41,10 +41,13 @@ def refusal(tmp_path, capsys, monkeypatch):
         (["--processes", 2**70], "--processes is 1180591620717411303424; expected a whole number from 1 to 1024"),
         (["--seed", -1], "--seed is -1; expected"),
         (["--seed", 2**70], "--seed is 1180591620717411303424; expected"),
-        (["--mode", "teleport", "--video", "film.gif"], "--video is of executed episodes; expected --mode execute"),
+        (
+            ["--mode", "teleport", "--animation", "film.gif"],
+            "--animation is of executed episodes; expected --mode execute",
+        ),
         (["--mode", "teleport", "--view"], "--view shows an executed episode; expected --mode execute"),
-        (["--video", "film.txt"], "film.txt"),
-        (["--video", "nowhere/film.gif"], "--video is nowhere/film.gif; expected a file in an existing folder"),
+        (["--animation", "film.txt"], "film.txt"),
+        (["--animation", "nowhere/film.gif"], "--animation is nowhere/film.gif; expected a file in an existing folder"),
         (["--json", "nowhere/out.json"], "--json is nowhere/out.json; expected a file in an existing folder"),
         (["--task", "bowl_on_shelf", "--target", "found"], "the shelf of bowl_on_shelf is known"),
         (["--demonstrations", 5], "demonstrations is 5; expected 1 or 10"),
@@ -86,7 +89,7 @@ def test_a_missing_extra_is_named(refusal, monkeypatch):
 
 def test_a_film_that_nothing_here_renders_is_refused(refusal, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disable")
-    error = refusal("--video", "film.gif")
+    error = refusal("--animation", "film.gif")
     assert "nothing renders off screen here (MUJOCO_GL is disable)" in error and "set MUJOCO_GL=egl" in error
 
 
@@ -94,12 +97,12 @@ def test_a_view_without_a_display_is_refused(refusal, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr("platform.system", lambda: "Linux")
-    assert "neither DISPLAY nor WAYLAND_DISPLAY is set; run it on a desktop, or --video FILE" in refusal("--view")
+    assert "neither DISPLAY nor WAYLAND_DISPLAY is set; run it on a desktop, or --animation FILE" in refusal("--view")
 
 
 def test_a_film_that_nothing_here_writes_is_refused(refusal, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    assert "MP4 needs the package imageio-ffmpeg" in refusal("--video", "film.mp4")
+    assert "MP4 needs the package imageio-ffmpeg" in refusal("--animation", "film.mp4")
 
 
 @pytest.mark.slow

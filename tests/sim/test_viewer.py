@@ -116,7 +116,9 @@ def test_a_window_that_does_not_open_is_refused(monkeypatch):
         raise RuntimeError("no GLX")
 
     monkeypatch.setattr(window_of, "launch_passive", broken)
-    with pytest.raises(InputError, match="the window does not open .no GLX.; see what the terminal says, or --video"):
+    with pytest.raises(
+        InputError, match="the window does not open .no GLX.; see what the terminal says, or --animation"
+    ):
         Viewer(falling()[0])
     monkeypatch.setattr(viewer, "OPENING", 0.01)
     monkeypatch.setattr(window_of, "launch_passive", lambda model, data, **panels: viewer.threading.Event().wait(5))
@@ -131,7 +133,9 @@ def test_where_no_window_opens(monkeypatch):
     with pytest.raises(InputError, match="neither DISPLAY nor WAYLAND_DISPLAY is set"):
         check_display()
     monkeypatch.setenv("DISPLAY", ":4099")
-    with pytest.raises(InputError, match=r"no window opens on this display \(.+\); run it on a desktop, or --video"):
+    with pytest.raises(
+        InputError, match=r"no window opens on this display \(.+\); run it on a desktop, or --animation"
+    ):
         check_display()
     monkeypatch.setattr("platform.system", lambda: "Darwin")
     with pytest.raises(InputError, match="on macOS no window opens"):

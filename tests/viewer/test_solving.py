@@ -1,10 +1,11 @@
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import CARRY, carried, composed, random_cloud, random_poses
+from conftest import CARRY, carried, composed, random_cloud
 
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
@@ -54,6 +55,18 @@ def test_approach_and_retreat_move_with_the_ends(demonstration, small_model):
     np.testing.assert_allclose(solving.path_between(problem, found.pick, found.goal), found.path, atol=1e-5)
 
 
+def test_a_lost_pick_is_found_from_many_starts(problem, monkeypatch):
+    last = solving.chosen(problem, 0)
+    motion = np.float32([1, 0, 0, 0, 0.02, 0.0, 0.0])
+    assert solving.dragged(problem, motion, last).tracked
+    none = dataclasses.replace(last, result=dataclasses.replace(last.result, first_residual=np.float32(np.nan)))
+    lost = dataclasses.replace(last, result=dataclasses.replace(last.result, first_residual=np.float32(1e-6)))
+    monkeypatch.setattr(solving, "carry", functools.partial(tdf.carry, config=CARRY))
+    for one in (none, lost):
+        found = solving.dragged(problem, motion, one)
+        assert not found.tracked and np.isfinite(found.energy)
+
+
 @pytest.mark.slow
 def test_the_pick_follows_a_dragged_object():
     """Of the shipped network: the pick of the moved cloud is the moved pick, as its latent turns with the cloud."""
@@ -79,6 +92,7 @@ def test_the_pick_follows_a_dragged_object():
         np.testing.assert_allclose(found.energy, last.energy, rtol=0.05)
         np.testing.assert_allclose(solving.energy_at(problem, found, found.pick), found.energy, rtol=0.02)
         np.testing.assert_array_equal(found.goal, last.goal)
+        assert found.tracked
         assert found.confidence == pytest.approx(float(result.confidence), abs=0.05) and min(found.seconds) > 0
 
 
@@ -134,10 +148,3 @@ def test_the_surface_lies_about_the_object(problem):
     pytest.importorskip("igl")
     triangles = solving.reconstructed(problem)
     assert triangles.ndim == 3 and triangles.shape[1:] == (3, 3)
-
-
-def test_poses_half_way(problem):
-    a, b = random_poses(0, 2)
-    half = solving._between(a, b)
-    np.testing.assert_allclose(half[4:], (a[4:] + b[4:]) / 2, atol=1e-6)
-    assert abs(half[:4] @ a[:4]) == pytest.approx(abs(half[:4] @ b[:4]), abs=1e-5)
