@@ -298,6 +298,15 @@ def colours_of(png):
     return len(np.unique(np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).reshape(-1, 3), axis=0))
 
 
+def on_screen(server, xyz):
+    """Where a point of the world is in the browser that is connected to a viewer, pixels."""
+    (client,) = server.get_clients().values()
+    camera = client.camera
+    x, y, z = Rotation.from_quat(camera.wxyz, scalar_first=True).inv().apply(np.asarray(xyz) - camera.position)
+    scale = camera.image_height / 2 / np.tan(camera.fov / 2)
+    return camera.image_width / 2 + scale * x / z, camera.image_height / 2 + scale * y / z
+
+
 # The robot in physics, and what its tests share.
 
 DOWN = np.diag([1.0, -1.0, -1.0, 1.0])  # the gripper points down

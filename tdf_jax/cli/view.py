@@ -16,7 +16,9 @@ class Waiting(threading.Event):
 
 
 def view(
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")],
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR|FILE")],
+    demonstrate: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=_NONE)] = None,
+    scale: float = 1.0,
     landscape: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint=_NONE)] = None,
     weights: Annotated[
         str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint="(default: those of the folder)")
@@ -25,28 +27,38 @@ def view(
     share: bool = False,
     no_browser: bool = False,
 ) -> None:
-    """Show a folder of `tdf imitate` or `tdf landscape` in a browser, until Ctrl-C. It needs the extra "viewer".
+    """Show a folder of results in a browser until Ctrl-C, or make a demonstration by hand.
+
+    It needs the extra "viewer".
 
     The object and its goal can be dragged: the pick is found again, and the path follows. The address is this machine's
     own.
 
     Args:
-        folder: folder that `tdf imitate` or `tdf landscape` wrote.
+        folder: folder that `tdf imitate` or `tdf landscape` wrote; with --demonstrate, mesh or cloud of the object.
+        demonstrate: .npz file for a demonstration that is made by hand on the object: drag a box of query points along
+            key poses.
+        scale: metres per unit of the object's file, such as 0.01 for centimetres.
         landscape: folder of `tdf landscape` to show with an imitation.
         weights: weights of the object, if they are not where the folder says.
         port: port of the address; 0 for any that is free.
         share: make a public link as well, by the relay of viser's authors: whoever has it sees and moves everything.
         no_browser: open no browser; print the address alone.
     """
-    import webbrowser
-
     from tdf_jax.landscape.storage import load_landscape
     from tdf_jax.solvers.imitation_scene import SCENE, load_imitation
-    from tdf_jax.viewer.local_server import address, serving, shared_address, viser_of
+    from tdf_jax.viewer.local_server import serving, viser_of
     from tdf_jax.viewer.solving import model_of, problem_of
     from tdf_jax.viewer.stage import Stage, look, show_landscape
 
     viser_of("tdf view")
+    if demonstrate is not None:
+        if landscape is not None or weights is not None:
+            raise InputError("tdf view: --demonstrate has no use for --landscape and --weights; drop them")
+        _demonstrate(folder, demonstrate, scale, port, share, no_browser)
+        return
+    if scale != 1:
+        raise InputError("tdf view: --scale is for an object with --demonstrate; give that, or drop --scale")
     alone = not (folder / SCENE).exists() and (folder / "landscape.npz").is_file()
     if alone and landscape is not None:
         raise InputError(f"tdf view: {folder} is a landscape, and there is --landscape {landscape}; drop one")
@@ -62,12 +74,39 @@ def view(
             show_landscape(server, energies)
             look(server, energies.grid.points.reshape(-1, 3))
         try:
-            print(f"{address(server)}  (Ctrl-C ends it)", flush=True)
-            if share:
-                print(f"{shared_address('tdf view', server)}  (public: whoever has it sees and moves everything)")
-            if not no_browser:
-                webbrowser.open(address(server))
-            Waiting().wait()
+            _wait(server, share, no_browser)
         finally:
             if stage is not None:
                 stage.close()
+
+
+def _demonstrate(file: Path, path: Path, scale: float, port: int, share: bool, no_browser: bool) -> None:
+    from tdf_jax.io.meshes import load_mesh
+    from tdf_jax.io.pointclouds import load_points
+    from tdf_jax.viewer.demonstrating import HandStage, check_demonstration_path
+    from tdf_jax.viewer.local_server import serving
+
+    check_demonstration_path("tdf view", path)
+    points = load_points(file, scale=scale)
+    try:
+        mesh = load_mesh(file, scale)
+    except InputError:  # the file has no faces; it has just been read as a cloud
+        mesh = None
+    with serving("tdf view", port) as server:
+        HandStage(server, points, path, mesh)
+        _wait(server, share, no_browser)
+
+
+def _wait(server, share: bool, no_browser: bool) -> None:
+    """Say where the server is, open it, and wait for Ctrl-C."""
+    import webbrowser
+
+    from tdf_jax.viewer.local_server import address, shared_address
+
+    print(f"{address(server)}  (Ctrl-C ends it)", flush=True)
+    if share:
+        link = shared_address("tdf view", server)
+        print(f"{link}  (public: whoever has it sees and moves everything)", flush=True)
+    if not no_browser:
+        webbrowser.open(address(server))
+    Waiting().wait()

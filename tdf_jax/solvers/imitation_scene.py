@@ -218,7 +218,12 @@ def _scene(arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> Imita
         int(arrays["demonstration_release"]),
         target,
     )
-    fields: dict[str, Any] = {field.name: arrays[f"result_{field.name}"] for field in dataclasses.fields(Result)}
+    # A field that a former tdf_jax did not know has its default, which says unknown.
+    required = [field.name for field in dataclasses.fields(Result) if field.default_factory is dataclasses.MISSING]
+    names = [field.name for field in dataclasses.fields(Result)]
+    fields: dict[str, Any] = {
+        name: arrays[f"result_{name}"] for name in names if name in required or f"result_{name}" in arrays
+    }
     fields |= {name: int(fields[name]) for name in INDICES}
     expected = arrays.get("expected_wxyz_xyz")
     known = {name: header[name] and Weights(**header[name]) for name in ("weights", "target_weights")}

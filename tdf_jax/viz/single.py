@@ -93,12 +93,10 @@ def trajectory_panel(
     view = View(cloud, triangles_of(mesh), trajectory, expected)
     box = bounds(np.asarray(query))
     shown = content(view, box)
-    if len(cloud) or view.triangles is not None:
-        draw(ax, view, box)
-    else:
-        draw(ax, View(np.asarray(trajectory.translations), None, trajectory, expected), box)
+    alone = not len(cloud) and view.triangles is None
+    draw(ax, View(np.asarray(trajectory.translations), None, trajectory, expected) if alone else view, box)
     frame(ax, shown, MARGIN * np.ptp(shown, axis=0))
-    _legend(ax)
+    _legend(ax, "object's points" if alone else None)
 
 
 def candidates_panel(
@@ -129,7 +127,7 @@ def candidates_panel(
     frame(ax, shown, MARGIN * np.ptp(shown, axis=0))
     colours = ListedColormap(COLOURS(np.linspace(0, 0.9, 64)))
     bar = cast(Figure, ax.figure).colorbar(
-        ScalarMappable(scale, colours), ax=ax, orientation="horizontal", shrink=0.6, pad=0.09, aspect=30
+        ScalarMappable(scale, colours), ax=ax, orientation="horizontal", shrink=0.6, pad=0.02, aspect=30
     )
     bar.set_label(f"energy of the {len(modes)} distinct picks (no unit)")
     bar.locator = MaxNLocator(4)
@@ -178,17 +176,23 @@ def surface_panel(ax: Axes3D, triangles: Float[np.ndarray, "faces 3 3"], points:
         ax.add_collection3d(polygons3d.surface(CENTIMETRES * triangles, LIGHT).collection(), autolim=False)
     else:
         ax.text2D(0.5, 0.9, "no point is inside: the surface is empty", ha="center", transform=ax.transAxes)
-    size: Any = 1.2
-    ax.scatter(*(CENTIMETRES * cloud.T), s=size, color=ESTIMATE, alpha=0.5, linewidths=0, label="points of the cloud")
+    size: Any = 3.0
+    ax.scatter(*(CENTIMETRES * cloud.T), s=size, color=ESTIMATE, alpha=0.8, linewidths=0, label="points of the cloud")
     shown = np.concatenate([points, triangles.reshape(-1, 3)])
     frame(ax, shown, MARGIN * np.ptp(shown, axis=0))
     _legend(ax)
 
 
-def _legend(ax: Axes3D) -> None:
-    legend = legend_of(ax)
+def _legend(ax: Axes3D, without: str | None = None) -> None:
+    legend = {name: handle for name, handle in legend_of(ax).items() if name != without}
     if legend:
-        place = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.02), "frameon": False, "fontsize": 7}
+        place = {
+            "loc": "upper center",
+            "bbox_to_anchor": (0.5, -0.02),
+            "frameon": False,
+            "fontsize": 7,
+            "markerscale": 2,
+        }
         ax.legend(legend.values(), legend.keys(), **place)
 
 

@@ -61,6 +61,22 @@ def test_a_folder_is_shown_until_ctrl_c(folder, landscape, what, monkeypatch, ca
     assert not [thread for thread in threading.enumerate() if "Worker" in thread.name]
 
 
+def test_an_object_is_shown_to_demonstrate_on(tmp_path, monkeypatch, capsys):
+    def interrupted(self, timeout=None):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tdf_jax.cli.view.Waiting.wait", interrupted)
+    tdf.build_mug().mesh.export(tmp_path / "mug.obj")
+    words = ["--demonstrate", tmp_path / "demo.npz", "--port", "0", "--no-browser"]
+    with pytest.raises(SystemExit) as stop:
+        main(["view", str(tmp_path / "mug.obj"), *map(str, words)])
+    assert stop.value.code == 130 and capsys.readouterr().out.startswith("http://127.0.0.1:")
+    assert not (tmp_path / "demo.npz").exists()
+    assert "expected a new .npz file" in refusal(capsys, tmp_path / "mug.obj", "--demonstrate", tmp_path / "demo.txt")
+    assert "drop them" in refusal(capsys, tmp_path / "mug.obj", *words[:2], "--weights", "mug")
+    assert "drop --scale" in refusal(capsys, tmp_path, "--scale", "0.01")
+
+
 def test_what_is_no_result_is_refused(folder, landscape, weights, tmp_path, capsys):
     assert "there is no folder" in refusal(capsys, tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()

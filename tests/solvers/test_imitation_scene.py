@@ -127,6 +127,14 @@ def test_files_of_another_version_and_damaged_ones_are_refused(tmp_path, scene):
             tdf.load_imitation(tmp_path)
 
 
+def test_what_a_former_tdf_jax_did_not_know_is_unknown(tmp_path, scene):
+    tdf.save_imitation(tmp_path / SCENE, scene)
+    changed(tmp_path / SCENE, result_latent=None, result_confidence=None)
+    read = tdf.load_imitation(tmp_path).result
+    assert np.isnan(read.confidence) and read.latent.shape[0] == 0
+    np.testing.assert_array_equal(read.energies, scene.result.energies)
+
+
 def test_a_batch_is_no_scene(demonstration, result):
     batch = jax.tree.map(lambda x: np.stack([np.asarray(x)] * 2), result)
     with pytest.raises(InputError, match=r"shape \(2, 3, 4, 7\); expected \(candidates, poses, 7\)"):

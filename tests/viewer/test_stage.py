@@ -5,7 +5,7 @@ import time
 import jax
 import numpy as np
 import pytest
-from conftest import CARRY, colours_of, random_cloud
+from conftest import CARRY, colours_of, on_screen, random_cloud
 from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
@@ -155,7 +155,7 @@ def test_a_real_mouse_drags_the_object_in_a_browser_and_the_pick_changes(shown, 
     assert f"x {x:.1f}, y {y:.1f}, z {z:.1f} cm" in text
     pick = shown.found.pick
     arrow = shown._grip.position + [0, 0, 0.75 * stage.GRIP * shown._size()]  # on the arrow that points up
-    begin, end = on_screen(shown, arrow), on_screen(shown, arrow + [0, 0, 0.06])
+    begin, end = on_screen(shown.server, arrow), on_screen(shown.server, arrow + [0, 0, 0.06])
     tab.mouse.move(*begin)
     tab.mouse.down()
     tab.mouse.move(*end, steps=8)
@@ -170,13 +170,3 @@ def test_a_real_mouse_drags_the_object_in_a_browser_and_the_pick_changes(shown, 
     assert f"x {x:.1f}, y {y:.1f}, z {z:.1f} cm" in tab.inner_text("body")
     assert tab.screenshot() != before
     tab.close()
-
-
-def on_screen(shown, xyz):
-    """Where a point of the world is in the browser, pixels."""
-    (client,) = shown.server.get_clients().values()
-    camera = client.camera
-    R = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
-    x, y, z = R.T @ (np.asarray(xyz) - camera.position)
-    scale = camera.image_height / 2 / np.tan(camera.fov / 2)
-    return camera.image_width / 2 + scale * x / z, camera.image_height / 2 + scale * y / z
