@@ -1,9 +1,10 @@
 """Imitation in one call: a demonstration and a new object's point cloud give a trajectory."""
 
 import dataclasses
+import inspect
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,21 +14,28 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import host
 from tdf_jax._internal.deprecation import caller_level, renamed_keywords
-from tdf_jax._internal.errors import ConfidenceWarning, InputError
+from tdf_jax._internal.devices import one_at_a_time
+from tdf_jax._internal.errors import ConfidenceWarning, InputError, TdfWarning
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.networks.encoding import encode
+from tdf_jax.networks.field import with_decoder_of
 from tdf_jax.networks.model import Model
 from tdf_jax.relation import Objects, carry_object, check_scene, kept_points, reference_of, target_field
 from tdf_jax.solvers.adam import OptimizeConfig, optimize
 from tdf_jax.solvers.initial import default_goal
 from tdf_jax.solvers.multistart import SolveConfig, solve
-from tdf_jax.solvers.pick import CarryConfig, carry
+from tdf_jax.solvers.pick import CarryConfig, carry, carry_together
 from tdf_jax.solvers.result import Result
 from tdf_jax.uncertainty.advice import look_from, points_at
 from tdf_jax.uncertainty.calibration import CALIBRATED, CURVES, confidence, recognition, surface_logit
 from tdf_jax.uncertainty.doubt import DOUBT, warn_of_category, warn_of_target
+
+# Objects whose picks an accelerator finds together. It is an estimate, as `devices.ACCELERATOR_POINTS` is: the first
+# stage then evaluates 65,536 query points.
+ACCELERATOR_TARGETS = 64
+T = TypeVar("T")
 
 
 @host
@@ -132,10 +140,7 @@ def imitate(
             result = dataclasses.replace(result, target_foreign_points=foreign_of_target)
         judged = _judged(result, model.info.name, field, cloud, reference)
         return dataclasses.replace(judged, foreign_points=foreign)
-    goal = None if goal is None else jnp.asarray(checks.pose("imitate()", "goal", goal), float)
-    if goal_offset is not None:
-        goal = default_goal(field, reference) if goal is None else goal
-        goal = goal + jnp.pad(jnp.asarray(checks.vector("imitate()", "goal_offset", goal_offset)), (4, 0))
+    goal = _goal(field, reference, goal, goal_offset)
     settings = {"goal": goal, "fix_last": fix_last, "progress": progress, "device_mesh": device_mesh}
     if isinstance(config, CarryConfig):
         result = carry(field, reference, key, config=config, **settings)
@@ -147,6 +152,15 @@ def imitate(
     else:
         result = solve(field, reference, key, energy=weights, config=config, **settings)
     return dataclasses.replace(result, foreign_points=foreign)
+
+
+def _goal(field, reference: Reference, goal, goal_offset) -> Array | None:
+    """The goal with its offset; None for the default one."""
+    goal = None if goal is None else jnp.asarray(checks.pose("imitate()", "goal", goal), float)
+    if goal_offset is not None:
+        goal = default_goal(field, reference) if goal is None else goal
+        goal = goal + jnp.pad(jnp.asarray(checks.vector("imitate()", "goal_offset", goal_offset)), (4, 0))
+    return goal
 
 
 def _merged(points) -> Any:
@@ -194,33 +208,130 @@ def imitate_batch(
     clouds: Iterable[Float[Array | np.ndarray, "points 3"]],
     *,
     key: PRNGKeyArray,
+    chunk_targets: int | None = None,
     **settings,
 ) -> list[Result]:
-    """Imitate on many new objects with one compiled program.
+    """Imitate on many new objects.
 
-    The demonstration is encoded once. Objects run one after the other: one object's starts already fill the machine,
-    and memory does not grow with their number.
+    The demonstration is encoded once. On an accelerator the picks of many objects are found together, in one program.
+    On a CPU, where one object's starts fill the machine, they are found one after the other, and memory does not grow
+    with their number; `chunk_targets` finds them together there too, which is not faster.
 
     Args:
         model: as for `imitate`.
         demonstration: as for `imitate`.
         clouds: one point cloud for each object, (points, 3), metres, world frame; sizes may differ.
         key: random key; object i uses `jax.random.fold_in(key, i)`.
+        chunk_targets: number of objects whose picks are found in one program. None chooses: 1 on a CPU, and
+            `ACCELERATOR_TARGETS` on an accelerator where the settings allow it. More than one needs a `CarryConfig`, a
+            demonstration without a target, and neither `progress` nor `device_mesh`.
         **settings: as for `imitate`, shared by all objects; so is a new target.
 
     Returns:
-        One result for each object, in order.
+        One result for each object, in order; those of `imitate` up to rounding.
 
     Raises:
-        InputError: no clouds, or as for `imitate`.
+        InputError: no clouds, or as for `imitate`; what is about one object names it.
+
+    Warns:
+        As `imitate`; what is about one object names it.
     """
     checks.key("imitate_batch()", key)
-    clouds = list(clouds)
-    if not clouds:
+    if chunk_targets is not None:
+        checks.count("imitate_batch()", "chunk_targets", chunk_targets)
+    every = list(clouds)
+    if not every:
         raise InputError("imitate_batch(): there are no clouds; expected at least one")
+    inspect.signature(imitate).bind_partial(**settings)  # a TypeError names what it does not know
     target_points, target_model = (settings.get(name) for name in ("target_points", "target_model"))
     reference = reference_of("imitate_batch()", model, demonstration, target_points, target_model)
+    keys = [jax.random.fold_in(key, index) for index in range(len(every))]
+    alone = _alone(reference, settings)
+    if chunk_targets is None:
+        chunk_targets = 1 if alone or one_at_a_time() else ACCELERATOR_TARGETS
+    if chunk_targets > 1:
+        if alone:
+            raise InputError(
+                f"imitate_batch(): chunk_targets is {chunk_targets}, and {alone}; expected 1, which imitates on one "
+                "object after the other"
+            )
+        results = []
+        for start in range(0, len(every), chunk_targets):
+            part = range(start, min(start + chunk_targets, len(every)))
+            results += _together(model, reference, every, keys, part, chunk_targets, **settings)
+        return results
     return [
-        imitate(model, reference, points, key=jax.random.fold_in(key, index), **settings)
-        for index, points in enumerate(clouds)
+        _naming(index, lambda index=index: imitate(model, reference, every[index], key=keys[index], **settings))
+        for index in range(len(every))
     ]
+
+
+def _alone(reference: Reference, settings: dict[str, Any]) -> str:
+    """Why objects cannot be imitated on together, in words; empty if they can be."""
+    if not isinstance(settings.get("config", CarryConfig()), CarryConfig) or settings.get("energy") is not None:
+        return "the method is not that of a CarryConfig"
+    if reference.contact is not None:
+        return "the demonstration has a target"
+    given = [name for name in ("progress", "device_mesh") if settings.get(name) is not None]
+    return f"there is a {given[0]}" if given else ""
+
+
+def _together(
+    model: Model,
+    reference: Reference,
+    clouds: list,
+    keys: list,
+    part: range,
+    room: int,
+    *,
+    goal=None,
+    goal_offset=None,
+    fix_last: bool = True,
+    seat: bool = True,
+    clean: bool = True,
+    config: CarryConfig = CarryConfig(),
+    **others,
+) -> list[Result]:
+    """Results of a part of the objects, whose picks one program finds that has room for `room` of them.
+
+    Of the settings of `imitate`, those in `others` are None, or have no effect here.
+    """
+    for name, value in (("fix_last", fix_last), ("seat", seat), ("clean", clean)):
+        checks.boolean("imitate_batch()", name, value)
+    if not fix_last and (goal is not None or goal_offset is not None):
+        raise InputError("imitate_batch(): there is a goal, and fix_last=False does not keep it; drop one of them")
+    fields, seen, foreign, goals = [], [], [], []
+    for index in part:
+        cloud = _merged(clouds[index])
+        field, kept = _naming(index, lambda cloud=cloud: encode(model, cloud, clean=clean, return_kept=True))
+        # Copies of the decoder's weights would take 2.6 MB each.
+        fields.append(with_decoder_of(field, fields[0]) if fields else field)
+        seen.append(kept_points(cloud, kept))
+        foreign.append(np.asarray(np.count_nonzero(~kept), np.int32))
+        end = _goal(field, reference, goal, goal_offset)
+        goals.append(default_goal(field, reference) if end is None else end)
+    found = carry_together(fields, reference, keys[part.start : part.stop], goals if fix_last else None, room, config)
+    results = []
+    for index, result, field, cloud, count in zip(part, found, fields, seen, foreign, strict=True):
+        judged = _naming(
+            index,
+            lambda result=result, field=field, cloud=cloud: _judged(result, model.info.name, field, cloud, reference),
+        )
+        results.append(dataclasses.replace(judged, foreign_points=count))
+    return results
+
+
+def _naming(index: int, call: Callable[[], T]) -> T:
+    """What a call about one object returns; what it raises and warns of names the object."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            value = call()
+        except InputError as error:
+            raise InputError(f"imitate_batch(): object {index}: {error}") from None
+    for one in caught:
+        words = one.message
+        if issubclass(one.category, TdfWarning):
+            words = f"imitate_batch(): object {index}: {words}"
+        warnings.warn(words, one.category, stacklevel=caller_level())
+    return value

@@ -10,6 +10,7 @@ from conftest import CARRY, compilations, random_cloud, random_poses
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.sampling import thin
+from tdf_jax.networks.field import stacked, stacked_axes, with_decoder_of
 
 CONFIG = tdf.OptimizeConfig(num_starts=3, iterations=5)
 KEY = jax.random.key(0)
@@ -103,6 +104,64 @@ def test_a_batch_is_every_target_with_a_key_of_its_own(small_model, imitate, dem
     assert len(results) == 3
     for index, (found, cloud) in enumerate(zip(results, clouds, strict=True)):
         assert_equal(found, imitate(reference, cloud, key=jax.random.fold_in(KEY, index)))
+
+
+@pytest.mark.parametrize("options", [{}, {"goal_offset": (0, 0, 0.1)}, {"fix_last": False}])
+def test_objects_together_are_objects_alone(small_model, demonstration, options):
+    """Clouds of three sizes, in two chunks of one program, whose second one is not full; with an approach."""
+    longer = dataclasses.replace(demonstration, grasp=1)
+    reference = tdf.describe(small_model, longer)
+    clouds = [random_cloud(seed, 40 + 5 * seed).astype(np.float32) for seed in (3, 5, 4)]
+    alone = tdf.imitate_batch(small_model, reference, clouds, key=KEY, config=CARRY, **options)
+    with compilations() as compiled:
+        together = tdf.imitate_batch(small_model, reference, clouds, key=KEY, chunk_targets=2, config=CARRY, **options)
+    assert compiled.count("jit(_carried)") <= 1  # none, if an earlier test has compiled it
+    for found, expected in zip(together, alone, strict=True):
+        assert (found.grasp, found.release, found.best) == (expected.grasp, expected.release, expected.best)
+        for field in dataclasses.fields(found):
+            one, other = (np.asarray(getattr(result, field.name)) for result in (found, expected))
+            assert one.shape == other.shape
+            np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-4, err_msg=field.name)
+
+
+def test_the_decoder_is_shared_by_the_fields_of_a_chunk(small_model, field):
+    other = tdf.encode(small_model, random_cloud(8).astype(np.float32))
+    shared = with_decoder_of(other, field)
+    assert shared.conditioned.blocks is field.conditioned.blocks
+    x = random_cloud(1)[:5].astype(np.float32)
+    np.testing.assert_array_equal(shared.descriptors(x), other.descriptors(x))
+    both = stacked([field, shared])
+    assert both.conditioned.blocks is field.conditioned.blocks
+    found = jax.vmap(lambda one: one.descriptors(x), in_axes=(stacked_axes(both),))(both)
+    np.testing.assert_allclose(found[0], field.descriptors(x), atol=1e-6)
+    np.testing.assert_allclose(found[1], other.descriptors(x), atol=1e-6)
+
+
+@pytest.mark.parametrize("chunk", [1, 2])
+def test_what_is_about_one_object_names_it(small_model, reference, chunk):
+    sized = dataclasses.replace(
+        small_model, info=dataclasses.replace(small_model.info, smallest_diagonal=0.1, largest_diagonal=0.5)
+    )
+    clouds = [TARGET, TARGET * np.float32(100)]
+    settings = {"key": KEY, "config": CARRY, "chunk_targets": chunk, "clean": False}
+    with pytest.warns(tdf.SizeWarning, match=r"^imitate_batch\(\): object 1: encode\(\): the bounding box") as caught:
+        tdf.imitate_batch(sized, reference, clouds, **settings)
+    assert len(caught) == 1 and caught[0].filename == __file__
+    with pytest.raises(InputError, match=r"^imitate_batch\(\): object 1: .*20 points; expected at least 21"):
+        tdf.imitate_batch(small_model, reference, [TARGET, TARGET[:20]], **settings)
+
+
+def test_what_one_program_cannot_do_is_refused(small_model, reference):
+    for settings, words in (
+        ({"config": tdf.SolveConfig()}, "not that of a CarryConfig"),
+        ({"progress": print}, "there is a progress"),
+        ({"fix_last": False, "goal_offset": (0, 0, 1)}, "does not keep it"),
+        ({"chunk_targets": 0}, "chunk_targets is 0"),
+    ):
+        with pytest.raises(InputError, match=words):
+            tdf.imitate_batch(small_model, reference, [TARGET], **{"key": KEY, "chunk_targets": 2} | settings)
+    with pytest.raises(TypeError, match="goals"):
+        tdf.imitate_batch(small_model, reference, [TARGET], key=KEY, chunk_targets=2, goals=None)
 
 
 def test_a_batch_shares_its_settings(small_model, reference):

@@ -7,5 +7,6 @@ Modules:
     pictures: optional outputs, which may fail
     streams: standard output and error, which may fail
     episodes: rows of simulated episodes beside published ones
+    targets: the objects of a folder, one after the other
     tasks: generated objects and targets
 """

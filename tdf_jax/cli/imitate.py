@@ -20,6 +20,7 @@ from tdf_jax._internal.files import replace_file, replace_folder
 from tdf_jax.cli.camera import choose, read_scene, table as cluster_table
 from tdf_jax.cli.options import Settings, make_scene, resolved
 from tdf_jax.cli.pictures import Pictures, check_animation, check_page
+from tdf_jax.cli.targets import imitate_targets
 from tdf_jax.cli.tasks import TaskScene, make_task, not_judged
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import describe
@@ -50,12 +51,22 @@ def imitate(settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()) 
     """Imitate a demonstrated trajectory on a new object; by default on a generated mug in a random pose.
 
     Writes a folder with result.json, trajectory.npz, trajectory.tum, scene.npz, imitation.png and loss.png; with
-    --page also imitation.html. `tdf view` shows the folder.
+    --page also imitation.html. With --targets, one such folder for every object of a folder. `tdf view` shows a folder.
     """
-    settings = resolved(settings)
     pictures = Pictures("tdf imitate")
-    with replace_folder("tdf imitate", settings.out, RESULT, NAMES) as folder:
-        record = _run(settings, folder, pictures)
+
+    def one(settings):
+        with replace_folder("tdf imitate", settings.out, RESULT, NAMES) as folder:
+            return _run(settings, folder, pictures)
+
+    if settings.targets is not None:
+        records = imitate_targets(settings, one, _plain_settings, RESULT)
+        if settings.json:
+            print(json.dumps(records, indent=1))
+        pictures.check()
+        return
+    settings = resolved(settings)
+    record = one(settings)
     if settings.clusters and not settings.json:
         print(cluster_table(record["camera"]))
     print(json.dumps(record, indent=1) if settings.json else _table(record, settings.out))
@@ -282,7 +293,7 @@ def _record(
         "schema": SCHEMA,
         "tdf_jax": tdf_jax.__version__,
         "seed": settings.seed,
-        "settings": {name: _plain(value) for name, value in dataclasses.asdict(settings).items()},
+        "settings": _plain_settings(dataclasses.asdict(settings)),
         "energy": None if energy is None else dataclasses.asdict(energy),
         "optimiser": dataclasses.asdict(config),
         "weights": dataclasses.asdict(model.info),
@@ -405,6 +416,10 @@ def _solutions(modes: list[dict]) -> str:
     """How many distinct picks there are, and how far behind the second is."""
     words = f"{len(modes)} distinct pick{'s' if len(modes) != 1 else ''}"
     return words if len(modes) < 2 else f"{words}; the second's loss is {modes[1]['energy']:.5f}"
+
+
+def _plain_settings(settings: dict) -> dict:
+    return {name: _plain(value) for name, value in settings.items()}
 
 
 def _plain(value):

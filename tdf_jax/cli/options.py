@@ -86,6 +86,8 @@ class Settings(SceneSettings):
         target_pose: pose of the target in the world: that of its file, or a random rotation and translation of it. With
             --task, given is upright with a random yaw.
         task: place a generated object on a generated target, both from one seed, as demonstrated on another such pair.
+        targets: folder of meshes and point clouds, instead of --target; --out gets a folder of results for each of
+            them, named as its file. Run again, the command does what is missing.
         depth: depth images of the new object instead of --target: 16-bit .png or .tif with --depth-scale, or .npy in
             metres. Without --mask, the table is removed and the demonstration's object is chosen among the others.
         intrinsics: focal lengths and principal point of the camera, pixels; or a file with them or with the matrix K
@@ -114,6 +116,7 @@ class Settings(SceneSettings):
     """
 
     target: Annotated[Path | None, _option("FILE|known|found", "a generated object; found with --task")] = None
+    targets: Annotated[Path | None, _option("DIR", "none")] = None
     task: Annotated[Literal["bowl_on_mug", "mug_on_rack", "bottle_in_container"] | None, _option(default="none")] = None
     depth: Annotated[tuple[Path, ...] | None, _option("FILE ...", "none")] = None
     intrinsics: Annotated[tuple[str, ...] | None, _option("FX FY CX CY|FILE ...", "none")] = None

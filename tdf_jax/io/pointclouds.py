@@ -16,6 +16,7 @@ from tdf_jax.io.pcd import read_pcd
 
 _TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".asc", ".pts")
 CLOUD_SUFFIXES = (".pcd", ".npy", ".npz", *_TEXT_SUFFIXES)
+SUFFIXES = MESH_SUFFIXES + CLOUD_SUFFIXES
 _ROUNDING = 1e-5  # metres that rounding to float32 may move a coordinate, a tenth of what a pose is exact to
 
 
@@ -48,7 +49,7 @@ def load_points(
             are float32 numbers so far from the origin that these are more than 1 mm apart.
     """
     function = "load_points()"
-    path = supported_file(function, path, MESH_SUFFIXES + CLOUD_SUFFIXES, scale)
+    path = supported_file(function, path, SUFFIXES, scale)
     if count is not None:
         checks.count(function, "count", count)
     checks.seed(function, seed)

@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -55,3 +57,25 @@ class DescriptorField:
     def _decode(self, function, x):
         x = checks.positions(f"DescriptorField.{function}()", "x", x)
         return decode(self.conditioned, x - self.origin)
+
+
+def with_decoder_of(field: DescriptorField, other: DescriptorField) -> DescriptorField:
+    """A field that holds the decoder's weights of another one of the same network, and not its own copy of them."""
+    own, shared = field.conditioned, other.conditioned
+    into = (shared.into[0], *own.into[1:])
+    return DescriptorField(dataclasses.replace(own, into=into, blocks=shared.blocks, out=shared.out), field.origin)
+
+
+def stacked(fields: Sequence[DescriptorField]) -> DescriptorField:
+    """Stack fields of one network along a first axis, but for the decoder's weights, which they share."""
+    first = fields[0].conditioned
+    parts = [(one.conditioned.latent, one.conditioned.invariants, *one.conditioned.into[1:]) for one in fields]
+    latent, invariants, linear, bias = (jnp.stack(part) for part in zip(*parts, strict=True))
+    whole = dataclasses.replace(first, latent=latent, invariants=invariants, into=(first.into[0], linear, bias))
+    return DescriptorField(whole, jnp.stack([field.origin for field in fields]))
+
+
+def stacked_axes(field: DescriptorField) -> DescriptorField:
+    """The argument `in_axes` of `jax.vmap` for a field that `stacked` made."""
+    axes: Any = {"latent": 0, "invariants": 0, "into": (None, 0, 0), "blocks": None, "out": None}
+    return DescriptorField(dataclasses.replace(field.conditioned, **axes), cast(Any, 0))

@@ -7,7 +7,8 @@ both.
 """
 
 import dataclasses
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +24,7 @@ from tdf_jax.energy.reference import Reference
 from tdf_jax.energy.residual import pick_residual, traced_pick_residual
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.geometry.transport import carry_to_picks
-from tdf_jax.networks.field import DescriptorField
+from tdf_jax.networks.field import DescriptorField, stacked, stacked_axes
 from tdf_jax.solvers.initial import default_goal
 from tdf_jax.solvers.multistart import SolveConfig, check_stage_settings, solve
 from tdf_jax.solvers.result import Result, with_ends
@@ -164,3 +165,65 @@ def carry(
 def pick_of(reference: Reference) -> Reference:
     """The pick alone, a demonstration of one pose."""
     return Reference(reference.descriptors[:1], Trajectory(reference.trajectory.wxyz_xyz[:1]), reference.query)
+
+
+# Fields of a result of `carry` that are known in a traced call.
+KNOWN = ("trajectories", "energies", "candidate_history", "initial_trajectories", "history", "residual")
+
+
+def carry_together(
+    fields: Sequence[DescriptorField],
+    reference: Reference,
+    keys: Sequence[PRNGKeyArray],
+    goals: Sequence[Float[Array, "7"]] | None,
+    room: int,
+    config: CarryConfig,
+) -> list[Result]:
+    """Call `carry` for several objects in one program.
+
+    Args:
+        fields: descriptor fields of the objects, by one network.
+        reference: the demonstration.
+        keys: random key for each object.
+        goals: pose at the release for each object, T_world_query, (7,); None for `fix_last=False`.
+        room: number of objects that the program has room for; fewer repeat the first one, and compile nothing new.
+        config: settings.
+
+    Returns:
+        The result of `carry` for each object, up to rounding.
+    """
+    some = [index if index < len(fields) else 0 for index in range(room)]
+    found = _carried(
+        stacked([fields[index] for index in some]),
+        reference,
+        jnp.stack([keys[index] for index in some]),
+        None if goals is None else jnp.stack([goals[index] for index in some]),
+        config=config,
+    )
+    found = {name: np.array(part) for name, part in found.items()}
+    for name in ("history", "residual"):  # unknown numbers; they stay in numpy, see `solve`
+        found[name][np.isinf(found[name])] = np.nan
+    results = []
+    for index, field in enumerate(fields):
+        parts = {name: part[index] for name, part in found.items()}
+        known = {name: part if name in ("history", "residual") else jnp.asarray(part) for name, part in parts.items()}
+        results.append(
+            Result(
+                **known,
+                origin=field.origin,
+                latent=field.latent,
+                first_residual=parts["residual"],
+                grasp=len(reference.approach),
+                release=-1 - len(reference.retreat),
+            )
+        )
+    return results
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _carried(fields, reference, keys, goals, *, config):
+    def one(field, key, goal):
+        result = carry(field, reference, key, goal=goal, fix_last=goal is not None, config=config)
+        return {name: getattr(result, name) for name in KNOWN}
+
+    return jax.vmap(one, in_axes=(stacked_axes(fields), 0, 0))(fields, keys, goals)

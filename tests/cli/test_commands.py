@@ -130,7 +130,7 @@ def test_the_record_tells_all_settings(folder, weights):
     record = record_of(folder)
     assert (record["schema"], record["tdf_jax"], record["seed"]) == (report.SCHEMA, tdf.__version__, 0)
     assert record["settings"] == {
-        "target": None, "scale": 1.0, "drop_invalid": False, "task": None, "target_object": None,
+        "target": None, "targets": None, "scale": 1.0, "drop_invalid": False, "task": None, "target_object": None,
         "target_weights": None,
         "target_pose": "random", "demonstration": None, "category": "mug",
         "trajectory": "wave",
