@@ -8,5 +8,6 @@ Modules:
     multistart: `solve`: Gauss-Newton from many starts in stages
     pick: `carry`: finds the pick and warps the demonstration from there to the goal
     result: result of any solver
+    stages: sizes and candidates of the stages of `solve`
     tracking: `track`: the pick on an object that moved, from the last pick
 """

@@ -15,9 +15,10 @@ import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.losses import pose_energy, waypoint_loss
 from tdf_jax.geometry import se3
-from tdf_jax.solvers import gauss_newton
+from tdf_jax.solvers import gauss_newton, stages
 from tdf_jax.solvers.initial import default_goal, random_starts
-from tdf_jax.solvers.multistart import Candidates, SolveConfig
+from tdf_jax.solvers.multistart import SolveConfig
+from tdf_jax.solvers.stages import Candidates
 
 solve = sys.modules["tdf_jax.solvers.multistart"]  # `tdf_jax.solve` is the function
 
@@ -75,7 +76,7 @@ def test_energies_and_gradients_are_those_of_the_energy(field, reference, pose_n
     problem = solve._problem(KEY, reference, size=3)
     assert problem.query.shape == (3, 3, 3) and problem.weights.sum() == 8
     starts = random_starts(KEY, field, reference, 5, "scattered", 0.1)
-    drawn = solve._candidates(np, starts, problem)
+    drawn = stages.candidates_of(np, starts, problem)
     R, place = drawn.R.reshape(-1, 3, 3), drawn.centroid.reshape(-1, 3)
     waypoint = np.tile(np.arange(4), 5)
     values = evaluate(R, place, waypoint, np.array([20, 20, 3, 0]), field, problem, weights, 128)
@@ -121,7 +122,7 @@ def test_the_curvature_is_that_of_reweighted_squares(field, reference):
     problem = solve._problem(KEY, reference, size=8)
     R, place = (
         jnp.asarray(part[0, :1])
-        for part in solve._candidates(np, random_starts(KEY, field, reference, 1, "scattered", 0.1), problem)[:2]
+        for part in stages.candidates_of(np, random_starts(KEY, field, reference, 1, "scattered", 0.1), problem)[:2]
     )
     shown = problem.descriptors[:1, 0]
 
@@ -164,7 +165,7 @@ def test_a_step_solves_the_damped_system_and_is_bounded():
 @pytest.mark.slow
 def test_chunks_do_not_show(field, reference):
     problem = solve._problem(KEY, reference, size=3)
-    drawn = solve._candidates(np, random_starts(KEY, field, reference, 2, "carried", 0.1), problem)
+    drawn = stages.candidates_of(np, random_starts(KEY, field, reference, 2, "carried", 0.1), problem)
     settings = (
         drawn.R.reshape(-1, 3, 3),
         drawn.centroid.reshape(-1, 3),
@@ -188,13 +189,13 @@ def test_chunks_do_not_show(field, reference):
 def test_carried_candidates_are_rigid_motions_of_the_demonstration(field, reference, xp):
     problem = solve._problem(KEY, reference, size=8)
     starts = random_starts(KEY, field, reference, 4, "scattered", 0.1)
-    drawn = solve._candidates(np, starts, problem)
+    drawn = stages.candidates_of(np, starts, problem)
     energy = np.random.default_rng(0).uniform(size=(4, 3))
     found = Candidates(*map(xp.asarray, (drawn.R[:, :3], drawn.centroid[:, :3], energy)))
     picked = Candidates(*map(xp.asarray, (drawn.R[2:, 1:2], drawn.centroid[2:, 1:2])))
-    shown_candidates = solve._candidates(np, reference.trajectory.wxyz_xyz, problem)
-    propagated = solve._propagated(xp, found, picked, 1, shown_candidates, xp.asarray(field.origin))
-    new = np.array(solve._poses(xp, propagated, problem), np.float64)
+    shown_candidates = stages.candidates_of(np, reference.trajectory.wxyz_xyz, problem)
+    propagated = stages.propagated(xp, found, picked, 1, shown_candidates, xp.asarray(field.origin))
+    new = np.array(stages.poses_of(xp, propagated, problem), np.float64)
     assert new.shape == (6, 3, 7)
     shown = np.array(reference.trajectory.shifted(field.origin).wxyz_xyz[:3], np.float64)
     for index, (row, waypoint) in enumerate(
@@ -221,13 +222,13 @@ def test_distinct_candidates_are_the_best_of_each_waypoint(xp):
     place[3, :, 0] = 0.05
     energy = np.array([[0.2, 0.4], [0.1, 0.3], [0.4, 0.2], [0.3, 0.1]])
     found = Candidates(*map(xp.asarray, (R, place, energy)))
-    best, rows = solve._distinct(xp, found, 3)
+    best, rows = stages.distinct(xp, found, 3)
     # Candidates 0 and 1 are 3 degrees apart and count as one.
     for waypoint, expected in enumerate([[1, 3, 2], [3, 2, 1]]):
         np.testing.assert_array_equal(best.R[:, waypoint], turns[expected])
         np.testing.assert_array_equal(best.centroid[:, waypoint], place[expected, waypoint])
         np.testing.assert_array_equal(rows[:, waypoint], expected)
-    most, _ = solve._distinct(xp, found, 4)
+    most, _ = stages.distinct(xp, found, 4)
     np.testing.assert_array_equal(most.R[3, 0], turns[0])  # none distinct is left
 
 
