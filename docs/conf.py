@@ -13,7 +13,6 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 
 import executed_notebooks  # noqa: E402
-
 from sphinx.errors import ExtensionError  # noqa: E402
 
 import tdf_jax  # noqa: E402
@@ -27,6 +26,7 @@ extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ex
 root_doc = "docs/index"
 include_patterns = ["docs/**", "notebooks/*.ipynb", "weights/*.md", "CONTRIBUTING.md", "CHANGELOG.md"]
 exclude_patterns = [".*", "**/.*", "tdf_jax", "tests", "bench", "build", "dist", "runs", "docs/results/runs"]
+exclude_patterns += ["docs/training.md"]  # for readers of the weights' records, which name it
 
 html_theme = "furo"
 html_title = f"tdf_jax {release}"
@@ -73,11 +73,11 @@ def sidebar(index: str) -> str:
     """Tables of contents, one of the pages that each section of the index links to."""
     tables = []
     for section in re.split(r"^## ", index, flags=re.MULTILINE)[1:]:
-        pages = re.findall(r"\]\(([^)#:\s]+\.(?:md|ipynb))\)", section)
-        if pages:
+        links = re.findall(r"\[([^\]]+)\]\(([^)#:\s]+\.(?:md|ipynb))\)", section)
+        if links:
             caption = section.partition("\n")[0]
             head = ["```{toctree}", ":hidden:", f":caption: {caption}", ""]
-            tables.append("\n".join([*head, *dict.fromkeys(pages), "```"]))
+            tables.append("\n".join([*head, *(f"{name[0].upper()}{name[1:]} <{page}>" for name, page in links), "```"]))
     return "\n\n".join(tables)
 
 

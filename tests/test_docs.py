@@ -14,7 +14,13 @@ from tdf_jax.cli.main import COMMANDS, main
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted(
-    [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *ROOT.glob("weights/*.md"), *ROOT.glob("notebooks/*.ipynb")]
+    [
+        *ROOT.glob("*.md"),
+        *(ROOT / ".github").rglob("*.md"),
+        *(ROOT / "docs").rglob("*.md"),
+        *ROOT.glob("weights/*.md"),
+        *ROOT.glob("notebooks/*.ipynb"),
+    ]
 )
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 
@@ -42,7 +48,7 @@ def test_links_lead_to_files_and_headings(page):
             continue
         path, _, anchor = link.partition("#")
         target = (page.parent / path).resolve() if path else page
-        assert target.exists(), f"{link}: no such file"
+        assert target.is_file(), f"{link}: no such file"  # a folder is no page of the site
         if anchor:
             assert anchor in anchors(target), f"{link}: no such heading"
 
@@ -54,7 +60,7 @@ def test_every_picture_and_page_is_linked():
         for link in LINK.findall(text(page))
         if "://" not in link
     }
-    files = {path for path in (ROOT / "docs").rglob("*") if path.suffix in {".md", ".png"}}
+    files = {path for path in (ROOT / "docs").rglob("*") if path.suffix in {".md", ".png", ".svg"}}
     assert files - linked - {ROOT / "docs" / "training.md"} == set()
 
 

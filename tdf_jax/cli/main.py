@@ -12,6 +12,7 @@ import jax
 import tyro
 from tqdm.auto import tqdm
 
+import tdf_jax
 from tdf_jax._internal.boundary import own_settings
 from tdf_jax._internal.compiled import kept_compiled
 from tdf_jax._internal.devices import platform_problem
@@ -24,7 +25,8 @@ from tdf_jax.paper.setting import DEPRECATED_FIELD_ENERGIES
 NO_CACHE = "--no-cache"  # of every command
 DESCRIPTION = (
     "Imitate a demonstrated pick-and-place trajectory on new objects. Compiled programs are kept in the user's cache, "
-    f"so that the next command starts sooner; {NO_CACHE} neither reads nor writes them."
+    f"so that the next command starts sooner; {NO_CACHE} neither reads nor writes them. "
+    "--version prints the version of tdf_jax, env much more."
 )
 MEMORY = "error: out of memory; lower the number of starts, poses, query points or points, or raise the pitch"
 # each is a function in the module of its name
@@ -41,6 +43,7 @@ COMMANDS = (
     "train",
     "reproduce",
     "simulate",
+    "env",
 )
 # Options of the release before by command; they are accepted for one release, with a warning.
 DEPRECATED_FLAGS = {
@@ -95,6 +98,9 @@ def _code(arguments: Sequence[str]) -> int | str | None:
     try:
         keep = contextlib.nullcontext() if NO_CACHE in arguments else kept_compiled()
         arguments = [word for word in arguments if word != NO_CACHE]
+        if arguments == ["--version"]:
+            print(tdf_jax.__version__)
+            return None
         with _warnings(), _signals(stopped), own_settings(), keep:
             commands = {name: getattr(importlib.import_module(f"tdf_jax.cli.{name}"), name) for name in COMMANDS}
             tyro.extras.subcommand_cli_from_dict(

@@ -786,6 +786,7 @@ def test_commands_are_the_functions_of_their_modules():
         "train",
         "reproduce",
         "simulate",
+        "env",
     }
     for name in command_line.COMMANDS:
         assert callable(getattr(sys.modules[f"tdf_jax.cli.{name}"], name))
