@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from tdf_jax._internal.units import UNITS
 from tdf_jax.io.content import UnsupportedError
-from tdf_jax.io.text import decode, numbers
+from tdf_jax.io.text import MIXED_SIGNS, decode, numbers
 
 _COMMENTS = ("#", "//", "%", "!")
 MOST_COLUMNS = 20  # with a normal, a colour, an intensity and some features; a depth image has hundreds
@@ -20,7 +20,6 @@ _NAME = re.compile(
 _METRES = {spelling: unit.metres for unit in UNITS for spelling in unit.spellings}
 _NAME_THEM = "or write the names of all columns into the first line of a text, such as x y z r g b"
 _MISSING = {"", "null", "none", "na", "n/a", "-", "--"}
-_MIXED = "has numbers with commas as well as points; expected decimal points only; remove the commas"
 # Six fields without a decimal point are enough for three numbers with decimal commas: 0,12,0,34,0,56.
 _WHOLE = r"\s*[+-]?\d+([eE][+-]?\d+)?\s*"
 _WHOLE_FIELDS = re.compile(f"{_WHOLE}(,{_WHOLE}){{5}}(,|$)")
@@ -94,7 +93,7 @@ def coordinate_columns(values: Float[np.ndarray, "rows columns"]) -> Float[np.nd
         The coordinates, (rows, 3).
 
     Raises:
-        UnsupportedError: there are less than three columns or more than 20, the first may be a number of the point, a
+        UnsupportedError: there are fewer than three columns or more than 20, the first may be a number of the point, a
             time, a label or a pixel, the first three may be a colour or a normal, or the rows are poses.
     """
     width = values.shape[1]
@@ -272,7 +271,7 @@ def _dialect(rows):
         if all(decimal.fullmatch(word) for row in words for word in row if "," in word or "." in word):
             return None, True
         if all(re.fullmatch(r"[-+\d.,eE]+", word) for row in words for word in row):
-            raise UnsupportedError(_MIXED)
+            raise UnsupportedError(MIXED_SIGNS)
     return ",", False
 
 
@@ -299,7 +298,7 @@ def _table(rows, delimiter, comma):
                 "and the same numbers after it, in each line"
             )
     if comma and any(re.fullmatch(r"[+-]?\d*\.\d+", cell) for row in table for cell in row):
-        raise UnsupportedError(_MIXED)
+        raise UnsupportedError(MIXED_SIGNS)
     return table
 
 

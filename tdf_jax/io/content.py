@@ -41,6 +41,7 @@ _FIXES = {
     "is an HDF5 file": "read the array by h5py and save it by np.save",
     "is a LAS cloud": "convert it to .ply",
 }
+_LONGEST_REASON = 300  # characters: some parsers quote all that they could not read
 _SPACING = 1e-3  # metres between neighbouring numbers of a file, above which a shape is not what was measured
 
 
@@ -89,9 +90,6 @@ def supported_file(function: str, path: str | Path, suffixes: tuple[str, ...], s
     return path
 
 
-LONGEST_REASON = 300  # characters: some parsers quote all that they could not read
-
-
 @contextmanager
 def reading(function: str, path: Path) -> Iterator[None]:
     """Turn what a reader raises into an `InputError` that names the file.
@@ -116,7 +114,7 @@ def reading(function: str, path: Path) -> Iterator[None]:
         reason = error.strerror or str(error)
         raise InputError(f"{function}: {path} cannot be opened ({reason}); expected a file you may read") from error
     except Exception as error:  # what parsers of damaged files raise goes from KeyError to RecursionError
-        reason = (str(error) or type(error).__name__)[:LONGEST_REASON]
+        reason = (str(error) or type(error).__name__)[:_LONGEST_REASON]
         suffix = path.suffix.lower()
         raise InputError(f"{function}: {path} cannot be read as {suffix} ({reason}); save it again") from error
 

@@ -52,11 +52,11 @@ def read_off(data: bytes) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarr
         )
     points, polygons = table[:num_vertices], table[num_vertices:]
     if any(len(point) < 3 for point in points):
-        raise ValueError("it has a vertex of less than three numbers")
+        raise ValueError("it has a vertex of fewer than three numbers")
     vertices = numbers([number for point in points for number in point[:3]]).reshape(-1, 3)
     sizes = indices([polygon[0] for polygon in polygons])
     if any(not 0 <= size < len(polygon) for size, polygon in zip(sizes, polygons)):
-        raise ValueError("it has a face with less corners than its first number promises")
+        raise ValueError("it has a face with fewer corners than its first number promises")
     corners = [corner for size, polygon in zip(sizes, polygons) for corner in polygon[1 : size + 1]]
     return vertices, triangulate(vertices, indices(corners), sizes)
 

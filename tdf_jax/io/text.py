@@ -16,6 +16,7 @@ _BYTE_ORDER_MARKS = {
     codecs.BOM_UTF16_LE: "utf-16-le",
     codecs.BOM_UTF16_BE: "utf-16-be",
 }
+MIXED_SIGNS = "has numbers with commas as well as points; expected decimal points only; remove the commas"
 
 
 def decode(data: bytes) -> str:
@@ -79,9 +80,7 @@ def numbers(tokens: Sequence[str]) -> Float[np.ndarray, " tokens"]:
     except ValueError:
         if any("," in token for token in tokens):
             if any("." in token for token in tokens) or any(token.count(",") > 1 for token in tokens):
-                raise UnsupportedError(
-                    "has numbers with commas as well as points; expected decimal points only; remove the commas"
-                ) from None
+                raise UnsupportedError(MIXED_SIGNS) from None
             tokens = [token.replace(",", ".") for token in tokens]
         return np.array([_number(token) for token in tokens])
 

@@ -63,8 +63,8 @@ WRONG = {
     "more faces than promised": (off("OFF\n7 6 0\n").encode(), "promises 7 vertices and 6 faces, and has 14 lines"),
     "no counts": (b"OFF\n", "does not begin by OFF and the numbers of vertices, faces and edges"),
     "words": (b"hello\nworld\n", "does not begin by OFF"),
-    "short face": (off(faces=[*FACES[:-1], "3 5 0"]).encode(), "a face with less corners than its first number"),
-    "short vertex": (off().replace("3 1 0\n", "3 1\n").encode(), "a vertex of less than three numbers"),
+    "short face": (off(faces=[*FACES[:-1], "3 5 0"]).encode(), "a face with fewer corners than its first number"),
+    "short vertex": (off().replace("3 1 0\n", "3 1\n").encode(), "a vertex of fewer than three numbers"),
     "vertex that is none": (off(faces=[*FACES[:-1], "3 5 0 7"]).encode(), "a face has vertex 7.* there are 7 vertices"),
     "negative": (off(faces=[*FACES[:-1], "3 5 0 -1"]).encode(), "a face has vertex -1"),
 }
