@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from tdf_jax._internal.errors import InputError
-from tdf_jax.evaluation.places import BELOW_RIM, crossings, frame
+from tdf_jax.evaluation.places import BELOW_RIM, crossings
 from tdf_jax.geometry.symmetry import FOLDS, ROUND
+from tdf_jax.shapes.shape import frame
 
 if TYPE_CHECKING:
     import trimesh

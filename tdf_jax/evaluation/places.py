@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tdf_jax._internal.errors import InputError
+from tdf_jax.shapes.shape import frame
 
 if TYPE_CHECKING:
     import trimesh
@@ -101,13 +102,6 @@ def measured_places(
         if "handle" in places:
             found["handle"] = frame(*_grip(section, height, walls, name))
     return {place: found[place] for place in PLACES if place in places}
-
-
-def frame(x: float, z: float, outward: float = 1.0) -> Float[np.ndarray, "4 4"]:
-    """T_object_frame at (x, 0, z), 4x4, z up, with its x axis along the object's x axis times `outward` (1 or -1)."""
-    T = np.diag([outward, outward, 1.0, 1.0])
-    T[:3, 3] = x, 0.0, z
-    return T
 
 
 def _grip(section, height: float, walls, name: str) -> tuple[float, float]:

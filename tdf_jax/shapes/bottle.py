@@ -10,7 +10,7 @@ import numpy as np
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.symmetry import ROUND
-from tdf_jax.shapes.shape import Shape, Solid, check_dimensions, draw_valid, frame, is_one_body, solid_mesh
+from tdf_jax.shapes.shape import Shape, Solid, check_dimensions, draw_valid, draws, frame, is_one_body, solid_mesh
 from tdf_jax.shapes.solid import Loft, Tube, bar_line, bends_freely, encloses, inset, section, swept, tube_rings
 
 SHOULDERS = ("arc", "slope")
@@ -144,12 +144,7 @@ def sample_bottle(rng: np.random.Generator) -> BottleParameters:
 
 
 def _draw(rng: np.random.Generator) -> BottleParameters:
-    def uniform(low, high):
-        return float(rng.uniform(low, high))
-
-    def chance(probability):
-        return rng.uniform() < probability
-
+    uniform, chance = draws(rng)
     height = uniform(0.12, 0.30)
     handle = chance(0.25)
     radius = height * (uniform(0.16, 0.28) if handle else uniform(0.12, 0.27))

@@ -9,7 +9,7 @@ import numpy as np
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.symmetry import ROUND
-from tdf_jax.shapes.shape import Shape, Solid, check_dimensions, draw_valid, frame, is_one_body, solid_mesh
+from tdf_jax.shapes.shape import Shape, Solid, check_dimensions, draw_valid, draws, frame, is_one_body, solid_mesh
 from tdf_jax.shapes.solid import Loft, inset, section
 
 _PROFILE = 60  # points along the side's profile
@@ -115,12 +115,7 @@ def sample_bowl(rng: np.random.Generator) -> BowlParameters:
 
 
 def _draw(rng: np.random.Generator) -> BowlParameters:
-    def uniform(low, high):
-        return float(rng.uniform(low, high))
-
-    def chance(probability):
-        return rng.uniform() < probability
-
+    uniform, chance = draws(rng)
     radius = uniform(0.05, 0.11)
     height = 2 * radius * uniform(0.22, 0.70)
     wall = radius * uniform(0.025, 0.10)

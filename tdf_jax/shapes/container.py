@@ -11,7 +11,7 @@ from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.symmetry import ROUND
 from tdf_jax.shapes.bottle import sample_bottle
-from tdf_jax.shapes.shape import Shape, Solid, check_dimensions, draw_valid, frame, is_one_body, solid_mesh
+from tdf_jax.shapes.shape import Shape, Solid, check_dimensions, draw_valid, draws, frame, is_one_body, solid_mesh
 from tdf_jax.shapes.solid import Bar, circle, rectangle
 
 STYLES = ("round", "box", "shelf")
@@ -143,12 +143,7 @@ def sample_container(
 
 
 def _draw(rng: np.random.Generator, width: float, height: float) -> ContainerParameters:
-    def uniform(low, high):
-        return float(rng.uniform(low, high))
-
-    def chance(probability):
-        return rng.uniform() < probability
-
+    uniform, chance = draws(rng)
     kind = rng.uniform()
     if kind < 0.25:
         length, across = (width * uniform(*ROOM) for _ in range(2))

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tdf_jax._internal.errors import InputError
-from tdf_jax.shapes.shape import Shape, Solid, check_dimensions, draw_valid, frame, is_one_body, solid_mesh
+from tdf_jax.shapes.shape import Shape, Solid, check_dimensions, draw_valid, draws, frame, is_one_body, solid_mesh
 from tdf_jax.shapes.solid import Frusta, Tube, bar_line, bends_freely, in_frusta, inset, polygon, swept, tube_rings
 
 HANDLE_STYLES = ("d", "ring", "ear", "square")
@@ -174,12 +174,7 @@ def sample_mug(rng: np.random.Generator) -> MugParameters:
 
 
 def _draw(rng: np.random.Generator) -> MugParameters:
-    def uniform(low, high):
-        return float(rng.uniform(low, high))
-
-    def chance(probability):
-        return rng.uniform() < probability
-
+    uniform, chance = draws(rng)
     height = uniform(0.07, 0.13)
     top = height * uniform(0.33, 0.63)
     bottom = top * (uniform(0.96, 1.03) if chance(0.5) else uniform(0.65, 1.0))

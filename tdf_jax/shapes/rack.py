@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.symmetry import about_z
-from tdf_jax.shapes.shape import Shape, Solid, check_dimensions, draw_valid, frame, is_one_body, solid_mesh
+from tdf_jax.shapes.shape import Shape, Solid, check_dimensions, draw_valid, draws, frame, is_one_body, solid_mesh
 from tdf_jax.shapes.solid import Bar, circle, inset, outline_gauge, rectangle
 
 OUTLINES = ("round", "square")
@@ -158,12 +158,7 @@ def sample_rack(rng: np.random.Generator) -> RackParameters:
 
 
 def _draw(rng: np.random.Generator) -> RackParameters:
-    def uniform(low, high):
-        return float(rng.uniform(low, high))
-
-    def chance(probability):
-        return rng.uniform() < probability
-
+    uniform, chance = draws(rng)
     height = uniform(0.22, 0.36)
     length = height * uniform(0.36, 0.65)
     thickness = uniform(0.006, 0.012)

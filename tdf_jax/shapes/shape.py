@@ -2,7 +2,7 @@
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -152,6 +152,11 @@ def draw_valid(draw, check, rng: np.random.Generator):
         except InputError:
             continue
         return parameters
+
+
+def draws(rng: np.random.Generator) -> tuple[Callable[[float, float], float], Callable[[float], bool]]:
+    """Two draws of a generator: a number between two limits, and whether something of a given probability happens."""
+    return lambda low, high: float(rng.uniform(low, high)), lambda probability: rng.uniform() < probability
 
 
 def frame(x: float, z: float, outward: float = 1.0) -> Float[np.ndarray, "4 4"]:
