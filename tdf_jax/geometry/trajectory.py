@@ -19,7 +19,7 @@ from tdf_jax.geometry import se3
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses of the query frame in the world, from the pick (index 0) to the place (the last index).
+    """Poses of the query frame in the world, in the order of the motion, such as from the pick to the goal.
 
     A trajectory is a pytree of one array, so `jax.vmap` and `jax.grad` accept it. `T_world_query[i]` is pose i:
     x_world = R_i x_query + t_i.
