@@ -71,7 +71,7 @@ def encode(
     A network expects clouds of the density that it was trained on (`model.info.cloud_points`). `encode` therefore takes
     several farthest-point subsamples of a denser cloud, which are different samples of the surface, and averages their
     latents. It uses all points of a cloud that is no denser, and of every cloud if the density is unknown, as for
-    converted weights. docs/guide/training.md has the measurements.
+    converted weights. docs/results/training.md has the measurements.
 
     Foreign points are removed first, if they are at most 30 % of the cloud: points far from all else, and, with weights
     that know the density and the size of their training clouds, points that do not fit the field of the others. The

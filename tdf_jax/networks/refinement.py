@@ -28,7 +28,7 @@ def refine(model: Model, field: DescriptorField, points: Float[Array, "points 3"
     The encoder sees a few hundred points of an object at a time, which bounds the accuracy of the encoded surface.
     `refine` lowers the mean of (occupancy - 1/2)^2 over up to 1500 points by gradient steps on the latent; the weights
     of the network do not change. It improves shapes, as for reconstruction and clearance. Poses that are found with a
-    refined field hardly differ (docs/guide/evaluation.md). It has no reverse-mode derivative.
+    refined field hardly differ (docs/results/evaluation.md). It has no reverse-mode derivative.
 
     Args:
         model: network that encoded the field.

@@ -1,6 +1,7 @@
 """Surface of a descriptor field: where its occupancy is 1/2, as triangles."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -47,5 +48,5 @@ def surface_triangles(
 @jax.jit
 def _logits(field, x):
     # Marching cubes interpolates between grid points: probabilities, which jump from 0 to 1, would give stairs.
-    p = jax.numpy.clip(field.occupancy(x), 1e-6, 1 - 1e-6)
-    return jax.numpy.log(p) - jax.numpy.log1p(-p)
+    p = jnp.clip(field.occupancy(x), 1e-6, 1 - 1e-6)
+    return jnp.log(p) - jnp.log1p(-p)
