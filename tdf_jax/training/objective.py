@@ -91,7 +91,7 @@ def frame_error(
     A symmetric object has several equivalent fronts, and the nearest one counts. Without a term for the front, the
     network aligns all vectors of a symmetric object's latent with its axis and represents nothing but shapes of
     revolution. With this term and displaced clouds (`NetworkConfig.symmetry_breaking_offset`), it distinguishes the
-    sides. docs/guide/training.md has the measurements.
+    sides. docs/results/training.md has the measurements.
 
     Args:
         params: parameters, see `pair_loss`.
