@@ -301,7 +301,7 @@ def points(function: str, value: Any, name: str = "points") -> Any:
 
     Raises:
         InputError: the shape is not (points, 3), there are fewer than 21, one is not finite, all are equal, or rows
-            are no measurements, see `invalid_rows`.
+            are no measurements, see `repeated_rows`.
     """
     if not isinstance(value, jax.Array):
         value = plain_array(function, name, value)
