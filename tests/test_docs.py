@@ -101,3 +101,13 @@ def test_names_in_the_documentation_exist(page):
         assert hasattr(tdf_jax, name), f"tdf.{name}"
     for path in set(re.findall(r"`(tdf_jax(?:\.\w+)+)", words)):
         pkgutil.resolve_name(path)
+
+
+def test_every_public_name_is_in_the_reference_of_one_package():
+    """`make docs` writes the reference of a package where its page has this block."""
+    pages = sorted((ROOT / "docs" / "api" / "packages").glob("*.md"))
+    packages = [package for page in pages for package in re.findall(r"^```\{public\} (\w+)$", text(page), re.MULTILINE)]
+    assert len(packages) == len(set(packages)) == len(pages)
+    assert {getattr(tdf_jax, name).__module__.split(".")[1] for name in tdf_jax.__all__} == set(packages)
+    index = text(ROOT / "docs" / "index.md")
+    assert all(f"(api/packages/{page.name})" in index for page in pages)

@@ -64,12 +64,19 @@ def test_languages_of_blocks_are_known():
         assert set(re.findall(r"^```(\w+)", page.read_text(), re.MULTILINE)) <= known, page
 
 
+def command_lines(block: str) -> list[str]:
+    """The lines of `tdf` in a block for a shell: continued lines are joined, and its variables are replaced."""
+    lines = [line.partition("  #")[0].strip() for line in block.replace("\\\n", " ").splitlines()]
+    variables = dict(found.groups() for line in lines if (found := re.fullmatch(r'(\w+)="?([^"]*)"?', line)))
+    lines = [re.sub(r"\$(\w+)", lambda found: variables[found[1]], line) for line in lines if line.startswith("tdf ")]
+    return list(dict.fromkeys(lines))
+
+
 COMMAND_LINES = [
-    (page, line.partition("#")[0].strip())
+    (page, line)
     for page in [*PAGES, *sorted((DOCS / "results").glob("*.md"))]
     for block in blocks(page, "sh")
-    for line in block.splitlines()
-    if line.startswith("tdf ")
+    for line in command_lines(block)
 ]
 
 
