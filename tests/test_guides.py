@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import random_cloud
+from conftest import carried, random_cloud
 
 import tdf_jax as tdf
 from tdf_jax.cli.main import COMMANDS, main
@@ -162,6 +162,8 @@ def test_devices_and_batches(run, assumed, monkeypatch):
 
 
 def test_targets(run, small_model, demonstration):
+    released = carried(np.asarray(demonstration.object_motion), demonstration.points)
+    meeting = released.mean(axis=0)
     names = {
         "jax": jax,
         "tdf": tdf,
@@ -170,9 +172,9 @@ def test_targets(run, small_model, demonstration):
         "bowl_cloud": demonstration.points,
         "path": demonstration.trajectory,
         "grip": demonstration.query,
-        "mug_cloud": random_cloud(5) + [0.3, 0, 0],
-        "contact": demonstration.query,
-        "pose": np.array([1.0, 0, 0, 0, 0.6, -0.2, 0.1]),
+        "mug_cloud": random_cloud(5) - random_cloud(5).mean(axis=0) + meeting + [0.05, 0.05, 0],
+        "contact": tdf.box_query(jax.random.key(3), 8, size=0.05),
+        "pose": np.concatenate([[1.0, 0, 0, 0], meeting]),
         "new_bowl": random_cloud(3),
         "new_mug": random_cloud(6) + [0.2, 0.1, 0],
     }
