@@ -5,6 +5,7 @@ link to a file that is no page, such as a JSON or a notebook's script, is a down
 """
 
 import inspect
+import json
 import re
 import sys
 from pathlib import Path
@@ -40,6 +41,7 @@ myst_heading_anchors = 4  # as GitHub makes them
 myst_enable_extensions = ["dollarmath", "attrs_block"]
 nb_execution_mode = "off"  # `executed_notebooks` gives them with their outputs
 nb_merge_streams = True
+FAST = "The outputs on this site are those of the fast mode, with few starts and query points: yours are better."
 
 add_module_names = False
 autodoc_member_order = "bysource"
@@ -86,7 +88,10 @@ def complete(app, page: str, source: list[str]) -> None:
     if page == root_doc:
         source[0] += "\n" + sidebar(source[0])
     if page.startswith("notebooks/"):
-        source[0] = executed_notebooks.executed(HERE.parent / f"{page}.ipynb")
+        notebook = json.loads(executed_notebooks.executed(HERE.parent / f"{page}.ipynb"))
+        goal = notebook["cells"][0]
+        goal["source"] = "".join(goal["source"]) + f"\n\n*{FAST}*"
+        source[0] = json.dumps(notebook)
     source[0] = re.sub(r"^```\{public\} (\w+)\n```$", lambda found: reference(found[1]), source[0], flags=re.MULTILINE)
 
 

@@ -22,7 +22,6 @@ from tdf_jax.cli.main import COMMANDS, main
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
-ELSEWHERE = {"README.md", "docs/guide/camera.md"}
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md")), *sorted((DOCS / "guide").glob("*.md"))]
 
 
@@ -48,13 +47,6 @@ def run(tmp_path, monkeypatch):
 def assumed(small_model, demonstration):
     """The names of the README's example, with a small network."""
     return {"jax": jax, "tdf": tdf, "model": small_model, "demo": demonstration, "new": random_cloud(3).astype("f4")}
-
-
-def test_every_page_with_code_is_tested():
-    pages = {str(page.relative_to(ROOT)) for page in PAGES if blocks(page, "python")}
-    source = Path(__file__).read_text()
-    named = {f"docs/{page}" for page in re.findall(r'run\(\s*"([\w/]+\.md)"', source)}
-    assert pages == named | ELSEWHERE
 
 
 def test_languages_of_blocks_are_known():
@@ -142,13 +134,6 @@ def test_gradients(run, assumed):
     assert names["pull"].shape == assumed["new"].shape and np.abs(names["pull"]).max() > 0
 
 
-def test_landscapes(run, assumed):
-    names = assumed | {"shown": random_cloud(0).astype("f4"), "handle": np.array([0.3, -0.2, 0.1])}
-    names = run("guide/landscape.md", names)
-    assert names["landscape"].values.shape == (7, 51, 51, 51)
-    assert names["landscape"].combined.shape == (51, 51, 51) and names["landscape"].minimisers.shape == (7, 3)
-
-
 def test_devices_and_batches(run, assumed, monkeypatch):
     joined = []
     monkeypatch.setattr(jax.distributed, "initialize", lambda *where, **which: joined.append((where, which)))
@@ -181,69 +166,3 @@ def test_targets(run, small_model, demonstration):
     result = run("guide/targets.md", names)["result"]
     assert result.object_motion.shape == (7,) and result.goal.shape == (7,)
     assert result.target_trajectories.shape[1:] == (1, 7)
-
-
-@pytest.mark.slow
-def test_quick_start(run, capsys):
-    names = run("quickstart.md")
-    assert names["result"].trajectory.matrices.shape == (7, 4, 4)
-    assert float(names["result"].confidence) > 0.9
-    for part in ("pick", "goal", "recognised", "picks", "energies", "advice"):
-        assert hasattr(names["result"], part)
-
-
-@pytest.mark.slow
-def test_own_object(run, tmp_path):
-    mug = tdf.build_mug(tdf.MugParameters(height=0.09, handle_style="ring", handle_top=0.075))
-    mesh = mug.mesh.copy()
-    mesh.apply_scale(100)
-    mesh.export(tmp_path / "my_mug.obj")
-    scan = np.concatenate([tdf.sample_surface(mug.mesh, 500, 0), np.full((3, 3), np.nan)])
-    np.savetxt(tmp_path / "scan.xyz", scan)
-    header = f"ply\nformat ascii 1.0\nelement vertex {len(scan)}\n"
-    header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
-    (tmp_path / "my_scan.ply").write_text(header + (tmp_path / "scan.xyz").read_text())
-    shown = tdf.build_mug()
-    handle = shown.handle_frame[:3, 3]
-    path = tdf.lift_over(5, start=handle, end=handle + [0.0, 0.3, 0.1])
-    query = tdf.box_query(jax.random.key(1), 128, size=0.06)
-    tdf.save_demonstration(
-        tmp_path / "demo.npz", tdf.Demonstration(tdf.sample_surface(shown.mesh, 1500, 1), path, query)
-    )
-    names = run("guide/objects.md")
-    assert len(names["scan"]) == 500
-    assert abs(tdf.surface_logit(names["field"], names["points"])) < 1
-    error = names["result"].pick[4:] - mug.handle_frame[:3, 3]
-    assert np.linalg.norm(error) < 0.02
-    np.testing.assert_allclose(names["placed"].goal, names["goal"], atol=1e-5)
-    again = tdf.load_trajectory("imitated.npz").wxyz_xyz
-    np.testing.assert_allclose(again, names["result"].trajectory.wxyz_xyz, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_uncertainty(run):
-    """The second block needs a cloud whose handle is hidden, and a camera that sees it from where the result says."""
-    mug = tdf.build_mug()
-    handle = mug.handle_frame[:3, 3]
-    path = tdf.wave(num_poses=7, start=handle, end=handle + [0.0, 0.3, 0.1])
-    demo = tdf.Demonstration(
-        tdf.sample_surface(mug.mesh, 1500, 0), path, tdf.box_query(jax.random.key(1), 128, size=0.06)
-    )
-    whole = tdf.sample_surface(tdf.build_mug(tdf.MugParameters(height=0.09)).mesh, 3000, 1)
-    asked = []
-
-    def take_cloud(from_direction):
-        asked.append(np.asarray(from_direction))
-        return whole[whole @ asked[0] > 0]
-
-    names = {"jax": jax, "tdf": tdf, "model": tdf.load_model("mug"), "demo": demo, "take_cloud": take_cloud}
-    with pytest.warns(tdf.ConfidenceWarning):
-        names = run("guide/uncertainty.md", names | {"new": whole[whole[:, 0] < 0]})
-    assert len(asked) == 1 and asked[0][0] > 0.5  # the handle is along +x
-    assert np.linalg.norm(names["result"].pick[4:] - handle) < 0.03
-    assert names["found"].covariance.shape == (6, 6)
-
-
-@pytest.mark.slow
-def test_robot(run, robot, tmp_path):
-    run("guide/robot.md")
