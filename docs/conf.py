@@ -56,7 +56,8 @@ napoleon_use_rtype = False
 def names_of(package: str) -> list[str]:
     """Public names that a package defines, in the order of the alphabet."""
     values = {name: getattr(tdf_jax, name) for name in tdf_jax.__all__}
-    return [name for name, value in values.items() if value.__module__.split(".")[1] == package]
+    homes = {name: value.__name__ if inspect.ismodule(value) else value.__module__ for name, value in values.items()}
+    return [name for name, home in homes.items() if home.split(".")[1] == package]
 
 
 def reference(package: str) -> str:
@@ -64,7 +65,9 @@ def reference(package: str) -> str:
     lines = ["```{eval-rst}", ".. currentmodule:: tdf_jax", ""]
     for name in names_of(package):
         value = getattr(tdf_jax, name)
-        if inspect.isclass(value):
+        if inspect.ismodule(value):
+            lines += [f".. automodule:: tdf_jax.{name}", "   :members:", ""]
+        elif inspect.isclass(value):
             lines += [f".. autoclass:: {name}", "   :members:", ""]
         else:
             lines += [f".. autofunction:: {name}", ""]
