@@ -778,6 +778,7 @@ def test_commands_are_the_functions_of_their_modules():
         "imitate",
         "demonstrate",
         "landscape",
+        "view",
         "convert",
         "evaluate",
         "benchmark",
