@@ -17,7 +17,7 @@ from tdf_jax.sim.kinematics import FOLLOWING, Kinematics, kinematics_of
 from tdf_jax.sim.posture import HALF_TURN, Postures
 from tdf_jax.sim.retiming import retime
 from tdf_jax.sim.robot import Robot
-from tdf_jax.sim.transit import connect
+from tdf_jax.sim.transit import RESOLUTION, connect
 from tdf_jax.sim.workcell import Workcell
 
 APPROACH = 0.10  # metres along the approach before the pick, and back after the release
@@ -27,7 +27,10 @@ CLOSE_SECONDS, OPEN_SECONDS = 1.0, 0.6  # to close the fingers and to open them
 CARRYING = 0.4  # factor on the limits of velocity and acceleration with an object in the hand, which swings and slips
 RATE = 125.0  # samples per second
 DEPARTURE, ARRIVAL = 0.08, 0.12  # metres of the path that are followed even where the arm cannot follow its middle
-SHORTER = (1.0, 0.5)  # factors on approach, retreat and arrival that are tried
+# Factors on approach, retreat and arrival that are tried as they are and turned by half a turn, and then the last one,
+# with which departures are half as long: near the ends of the arm's reach it can leave straight by 3 cm and not by 5.
+SHORTER, SHORTEST = (1.0, 0.5), 0.25
+NARROW = 0.008  # radians between tested positions of free motions from ends that are so near
 MOST_POSTURES = 4  # postures tried at either end then
 # Penetrations that a plan may have, metres. Clouds and fields know surfaces to a millimetre or two.
 TOUCHING = 0.002
@@ -156,12 +159,16 @@ def plan_motion(
     postures = Postures(kinematics)
     reasons: list[tuple[int, str]] = []
     for number, (poses, opening) in enumerate(zip(candidates, openings, strict=True)):
-        for half, share in itertools.product((np.eye(4), HALF_TURN), SHORTER):
+        halves = np.eye(4), HALF_TURN
+        for half, share in (*itertools.product(halves, SHORTER), *itertools.product(halves, [SHORTEST])):
             turned = np.asarray(poses, float) @ half
             path = _Path(turned, share * approach)
-            ways = _ways(postures, collisions, path, opening, share * ARRIVAL, seed, reasons)
+            ends = min(1.0, 2 * share) * DEPARTURE, share * ARRIVAL
+            ways = _ways(postures, collisions, path, opening, ends, seed, reasons)
             for there, carried, away in ways:
-                transits = _transits(robot, collisions, path, there[0], away[-1], opening, seed)
+                # The fingers may still be around the object.
+                step = RESOLUTION if share > SHORTEST else NARROW
+                transits = _transits(robot, collisions, path, there[0], away[-1], opening, seed, step)
                 if transits is None:
                     reasons.append((3, f"no free motion from home and back (RRT-Connect, seed {seed})"))
                     continue
@@ -215,14 +222,14 @@ def _between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def _ways(
-    postures: Postures, collisions, path: _Path, opening: float, arrival: float, seed: int, reasons
+    postures: Postures, collisions, path: _Path, opening: float, ends: tuple[float, float], seed: int, reasons
 ) -> Iterator[tuple]:
     """Joints to the pick, from there to the release, and away, for one posture of the arm after the other.
 
     The arm follows the whole path, or else both ends of it, joined by a free motion with the object in the hand.
     """
     kinematics, last = postures.kinematics, len(path.poses) - 1
-    leave, arrive = path.near_pick(DEPARTURE)[-1], path.near_release(arrival)[0]
+    leave, arrive = path.near_pick(ends[0])[-1], path.near_release(ends[1])[0]
     picks, releases = [], []
     for posture in postures.at(path.poses[path.pick]):
         start = _followed(kinematics, path, posture, path.pick, 0, leave)
@@ -332,16 +339,19 @@ def _free(collisions: Collisions, opening: float, kinematics: Kinematics | None 
     return free
 
 
-def _transits(robot: Robot, collisions: Collisions | None, path: _Path, first, last, opening: float, seed: int):
+def _transits(
+    robot: Robot, collisions: Collisions | None, path: _Path, first, last, opening: float, seed: int, resolution: float
+):
     """Free paths from home to the first pose and from the last pose home."""
     if collisions is None:
         return np.stack([robot.home, first]), np.stack([last, robot.home])
     T_start = collisions.T_world_object
     T_end = None if T_start is None else path.poses[path.release] @ np.linalg.inv(path.poses[path.pick]) @ T_start
-    there = connect(robot.home, first, robot.lower, robot.upper, _free(collisions, opening, T_object=T_start), seed)
+    limits = robot.lower, robot.upper
+    there = connect(robot.home, first, *limits, _free(collisions, opening, T_object=T_start), seed, resolution)
     if there is None:
         return None
-    back = connect(last, robot.home, robot.lower, robot.upper, _free(collisions, opening, T_object=T_end), seed)
+    back = connect(last, robot.home, *limits, _free(collisions, opening, T_object=T_end), seed, resolution)
     return None if back is None else (there, back)
 
 

@@ -24,7 +24,8 @@ class Postures:
     def at(self, T: Float[np.ndarray, "4 4"]) -> Iterator[Float[np.ndarray, " joints"]]:
         """Postures at a pose: what is found from home, then from anywhere.
 
-        Where the pose half a turn about the approach away is known, from its postures instead, the last joint turned.
+        Where the pose half a turn about the approach away is known, from its postures first, the last joint turned:
+        there are no others if each can turn so far.
 
         Args:
             T: pose of the gripper's frame, 4x4, metres, world frame.
@@ -43,8 +44,9 @@ class Postures:
 
     def _search(self, T) -> Iterator[np.ndarray]:
         robot, seen = self.kinematics.robot, []
-        for start in self._starts(T):
-            solution = self.kinematics.solve(T, np.clip(start, robot.lower, robot.upper))
+        for number, start in enumerate(self._starts(T)):
+            find = self.kinematics.search if number else self.kinematics.solve
+            solution = find(T, np.clip(start, robot.lower, robot.upper))
             if solution is not None:
                 wrapped = _near(robot, solution)
                 if all(np.abs(wrapped - other).max() > SAME for other in seen):
@@ -54,9 +56,14 @@ class Postures:
     def _starts(self, T) -> Iterator[np.ndarray]:
         robot = self.kinematics.robot
         turned = list(self.at(T @ HALF_TURN)) if _key(T @ HALF_TURN) in self._found else []
+        all_turn = bool(turned)
         for one in turned:
-            yield one + np.append(np.zeros(len(one) - 1), -np.pi if one[-1] > robot.home[-1] else np.pi)
-        if turned:
+            last = one[-1] + np.array([-np.pi, np.pi])
+            within = last[(last >= robot.lower[-1]) & (last <= robot.upper[-1])]
+            all_turn &= len(within) > 0
+            if len(within):
+                yield np.append(one[:-1], within[np.argmin(np.abs(within - robot.home[-1]))])
+        if all_turn:
             return
         rng = np.random.default_rng(0)
         for number in range(1 + SEARCHES):

@@ -29,6 +29,10 @@ MAX_ACCELERATION = 3.0  # rad/s^2
 COMMANDS, SETTLE = 12, 0.8
 CLOSED = 0.015  # metres, gap at the last command but one from which the fingers close
 HEIGHTS = np.linspace(-0.05, 0.05, 101)  # metres from the site
+ASIDE = (0.0, -0.006, 0.006)  # metres along x from the site: where there are rays
+ROUNDING = 1e-6  # metres
+LEAST_ROWS = 3  # heights with the same gap that are pads: less is an edge
+GROOVE = 6  # heights that a groove across the pads may have
 LEVEL = 0.0005  # metres by which the gap may differ from one height to the next on pads, which may lean a little
 
 
@@ -329,15 +333,24 @@ def _gap(mujoco, model, data, site: str) -> tuple[float, float, float]:
     """Gap between the pads along the site's y axis, and their middle and tips along z, from the tips backwards."""
     frame = data.site(site)
     R, hit = frame.xmat.reshape(3, 3), np.zeros(1, np.int32)
-    gaps = []
-    for height in HEIGHTS[::-1]:
-        start = frame.xpos + height * R[:, 2]
-        sides = [mujoco.mj_ray(model, data, start, sign * R[:, 1], None, 1, -1, hit) for sign in (1, -1)]
-        gaps.append(sum(sides) if min(sides) >= 0 else np.nan)
-    between = np.flatnonzero(np.isfinite(gaps))
-    if not len(between):
+    heights = HEIGHTS[::-1]
+    gaps = np.full(len(heights), np.nan)
+    for row, height in enumerate(heights):
+        for aside in ASIDE:
+            start = frame.xpos + height * R[:, 2] + aside * R[:, 0]
+            sides = [mujoco.mj_ray(model, data, start, sign * R[:, 1], None, 1, -1, hit) for sign in (1, -1)]
+            gap = sum(sides) if min(sides) >= 0 else np.nan
+            # The middle counts, unless the pads have ribs beside it.
+            if np.isnan(gaps[row]) or gap < gaps[row] - ROUNDING:
+                gaps[row] = gap
+    even = np.abs(np.diff(gaps)) <= LEVEL
+    starts = [row for row in np.flatnonzero(np.isfinite(gaps)) if even[row : row + LEAST_ROWS - 1].all()]
+    if not starts:
         return np.nan, np.nan, np.nan
-    tip = int(between[0])
-    steps = np.flatnonzero(~(np.abs(np.diff(gaps[tip:])) <= LEVEL))  # where the pads end
-    pads = slice(tip, tip + int(steps[0]) + 1 if len(steps) else None)
-    return float(np.mean(gaps[pads])), float(HEIGHTS[::-1][pads].mean()), float(HEIGHTS[::-1][tip])
+    tip = int(starts[0])
+    steps = np.flatnonzero(~even[tip:])  # where the pads end
+    end = tip + int(steps[0]) + 1 if len(steps) else len(gaps)
+    gap = float(np.mean(gaps[tip:end]))
+    while (again := np.flatnonzero(np.abs(gaps[end : end + GROOVE] - gap) <= LEVEL)).size:  # beyond a groove
+        end += int(again[-1]) + 1
+    return gap, float(heights[tip:end].mean()), float(heights[tip])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import NamedTuple, cast
 
 import jax
@@ -158,6 +159,7 @@ def draw_episode(
     poses: str = "upright",
     known: Episode | None = None,
     scan: Scan | None = None,
+    reachable: Callable[[Episode, Robot, Collisions], bool] | None = None,
 ) -> Episode:
     """Draw an episode: the pair, and a start from which the true pick and the true release are within reach.
 
@@ -170,6 +172,8 @@ def draw_episode(
             both held by a fixture above the table.
         known: the demonstrated episode, if its target is to stand where it stood; otherwise another target is drawn.
         scan: the object, of the task's category, if it is not to be generated.
+        reachable: what says of an episode, the robot and the collisions of a cell with its bodies, the target free,
+            whether both are within reach; `within_reach` by default.
 
     Raises:
         NotDrawn: nothing within reach is drawn, or the object of `scan` fits neither the fingers nor a target.
@@ -223,7 +227,7 @@ def draw_episode(
             for turned in _turned(grip, made.T_world_object):
                 tried = dataclasses.replace(made, grip=turned)
                 tried.__dict__.update(bodies)
-                if within_reach(tried, robot, collisions):
+                if (reachable or within_reach)(tried, robot, collisions):
                     return tried
             rejected += 1
         redrawn += 1
@@ -273,19 +277,16 @@ def within_reach(episode: Episode, robot: Robot, collisions: Collisions) -> bool
     return True
 
 
-def demonstrate_episode(episode: Episode, seed: int, points: int = 1500) -> Demonstration:
-    """The demonstration that an episode's true pick and release are.
+def true_path(episode: Episode) -> Trajectory:
+    """Poses of the gripper's frame from the true pick to the true release, as a demonstration shows them.
 
     Args:
-        episode: an episode whose object stands upright.
-        seed: seed of the clouds. Query points are the same for all, so that demonstrations combine.
-        points: number of points of each cloud.
+        episode: the episode.
     """
-    rng = np.random.default_rng([SEED_SPACE, seed, episode.number, 8])
     pick, release = episode.pick, episode.release
     ends = {"rotation": pick[:3, :3], "end_rotation": release[:3, :3]}
-    T_world_contact = episode.T_world_target @ episode.T_target_contact
     if episode.task == "mug_on_rack":
+        T_world_contact = episode.T_world_target @ episode.T_target_contact
         # Along the peg a little above it, then down onto it: an arm is a millimetre or two too low with a mug in hand.
         mug, rack = cast(Mug, episode.object), cast(Rack, episode.target)
         hole, peg = mug.finger_hole, rack.parameters.peg_thickness
@@ -295,14 +296,25 @@ def demonstrate_episode(episode: Episode, seed: int, points: int = 1500) -> Demo
         onto = np.asarray(hang_on_rack(NUM_POSES - 2, pick[:3, 3], raised, approach=along, **ends).wxyz_xyz)
         down = onto[-1:].repeat(2, axis=0)
         down[:, 4:] = np.stack([(raised + release[:3, 3]) / 2, release[:3, 3]])
-        path = Trajectory(jnp.asarray(np.concatenate([onto, down])))
-    else:
-        height = float(episode.target.mesh.extents[2]) + CLEARANCE
-        path = _level(lift_over(NUM_POSES, pick[:3, 3], release[:3, 3], height=height, **ends))
+        return Trajectory(jnp.asarray(np.concatenate([onto, down])))
+    height = float(episode.target.mesh.extents[2]) + CLEARANCE
+    return _level(lift_over(NUM_POSES, pick[:3, 3], release[:3, 3], height=height, **ends))
+
+
+def demonstrate_episode(episode: Episode, seed: int, points: int = 1500) -> Demonstration:
+    """The demonstration that an episode's true pick and release are.
+
+    Args:
+        episode: an episode whose object stands upright.
+        seed: seed of the clouds. Query points are the same for all, so that demonstrations combine.
+        points: number of points of each cloud.
+    """
+    rng = np.random.default_rng([SEED_SPACE, seed, episode.number, 8])
+    T_world_contact = episode.T_world_target @ episode.T_target_contact
     key = jax.random.key(0)
     return Demonstration(
         points=moved(sample_surface(episode.object.mesh, points, rng), episode.T_world_object).astype(np.float32),
-        trajectory=path,
+        trajectory=true_path(episode),
         query=gripper_query(key, GRIPPER_POINTS, opening=episode.grip.opening),
         target=Target(
             points=moved(sample_surface(episode.target.mesh, points, rng), episode.T_world_target).astype(np.float32),

@@ -20,6 +20,7 @@ def connect(
     upper: Float[np.ndarray, " joints"],
     free: Callable[[Float[np.ndarray, " joints"]], bool],
     seed: int,
+    resolution: float = RESOLUTION,
 ) -> Float[np.ndarray, "waypoints joints"] | None:
     """Find a path of the joints between two postures on which nothing collides.
 
@@ -30,6 +31,7 @@ def connect(
         upper: upper limits, (joints,).
         free: whether nothing collides at positions (joints,).
         seed: seed of the planner, above 0; the path is a function of it.
+        resolution: radians between tested positions, norm over all joints.
 
     Returns:
         Corners of the path, (waypoints, joints), radians; None if none was found, or an end is not free.
@@ -39,7 +41,7 @@ def connect(
     """
     if not free(start) or not free(goal):
         return None
-    steps = max(2, int(np.ceil(np.linalg.norm(goal - start) / RESOLUTION)) + 1)
+    steps = max(2, int(np.ceil(np.linalg.norm(goal - start) / resolution)) + 1)
     if all(free(start + share * (goal - start)) for share in np.linspace(0, 1, steps)[1:-1]):
         return np.stack([start, goal])
     base, geometric, util = (extra("plan_joints()", f"ompl.{name}") for name in ("base", "geometric", "util"))
@@ -56,7 +58,7 @@ def connect(
     setup = geometric.SimpleSetup(space)
     setup.setStateValidityChecker(lambda state: bool(free(np.array([state[number] for number in range(count)]))))
     information = setup.getSpaceInformation()
-    information.setStateValidityCheckingResolution(RESOLUTION / space.getMaximumExtent())
+    information.setStateValidityCheckingResolution(resolution / space.getMaximumExtent())
     ends = []
     for positions in (start, goal):
         state = space.allocState()

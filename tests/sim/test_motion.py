@@ -8,7 +8,8 @@ import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.sim.board import Board
 from tdf_jax.sim.bodies import body_of
-from tdf_jax.sim.motion import CARRYING, Failure, plan_motion
+from tdf_jax.sim.kinematics import kinematics_of
+from tdf_jax.sim.motion import APPROACH, CARRYING, SHORTEST, Failure, plan_motion
 from tdf_jax.sim.workcell import OBJECT, build_workcell
 
 PHASES = ["transit", "approach", "grasp", "path", "release", "retreat", "return"]
@@ -148,6 +149,28 @@ def test_a_pick_out_of_reach_is_said(robot, corners):
     far[:, 0, 3] += 2
     with pytest.raises(InputError, match=r"plan_joints\(\): there is no motion: the pick .* out of reach"):
         tdf.plan_joints(tdf.Trajectory.from_matrices(far), robot)
+
+
+def test_near_the_end_of_its_reach_the_arm_leaves_as_far_as_it_can(robot, corners):
+    """The gripper faces the base, so that it must go out to leave: the release is 4 cm before the end of the reach."""
+    kinematics = kinematics_of(robot)
+    R = np.stack([(0.0, 0, 1), (0, 1, 0), (-1, 0, 0)], axis=1)  # along -x, closing along y
+
+    def facing(x):
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, (x, 0.1, 0.3)
+        return T
+
+    starts = robot.home + np.random.default_rng(0).uniform(-np.pi, np.pi, (40, 6))
+    reach = max(x for x in np.arange(0.4, 1.0, 0.005) if any_posture(kinematics, facing(x), starts))
+    poses = np.stack([corners[0], facing(reach - 0.04)])
+    motion = tdf.plan_joints(tdf.Trajectory.from_matrices(poses), robot)
+    retreat = gripper_poses(robot, motion.positions[motion.segment_slices()["retreat"]])
+    assert retreat[-1][0, 3] - retreat[0][0, 3] == pytest.approx(SHORTEST * APPROACH, abs=2e-3)
+
+
+def any_posture(kinematics, T, starts):
+    return any(kinematics.search(T, start) is not None for start in starts)
 
 
 @pytest.mark.slow

@@ -19,6 +19,10 @@ class Counted(Kinematics):
         self.solved.append(T)
         return super().solve(T, start, iterations)
 
+    def search(self, T, start, iterations=40):
+        self.solved.append(T)
+        return super().search(T, start, iterations)
+
 
 def test_every_posture_is_at_the_pose_and_another(robot):
     T, kinematics = downward(0.45, 0.1, 0.2), kinematics_of(robot)
@@ -42,3 +46,20 @@ def test_a_pose_is_searched_once_and_half_a_turn_from_what_is_known(robot):
     assert len(turned) == len(found)
     for joints in turned:
         assert angle(kinematics.pose(joints), T @ HALF_TURN) < 0.1
+
+
+def test_where_the_last_joint_cannot_turn_so_far_the_search_goes_on(robot):
+    """Half a turn of the gripper then needs other joints too, as on many arms of seven."""
+    narrow = dataclasses.replace(robot, lower=robot.lower.copy(), upper=robot.upper.copy())
+    narrow.lower[-1], narrow.upper[-1] = -2.0, 2.0
+    T, kinematics = downward(0.45, 0.1, 0.2), Counted(narrow)
+    postures = Postures(kinematics)
+    found = list(postures.at(T))
+    assert found and all(abs(joints[-1]) <= 2 for joints in found)
+    within = sum(abs(abs(joints[-1]) - np.pi) <= 2 for joints in found)
+    assert within < len(found)
+    turned = list(postures.at(T @ HALF_TURN))
+    assert len(kinematics.solved) == 2 * (1 + SEARCHES) + within
+    assert {tuple(np.round(joints, 2)) for joints in turned} == {
+        tuple(np.round(joints, 2)) for joints in Postures(Kinematics(narrow)).at(T @ HALF_TURN)
+    }

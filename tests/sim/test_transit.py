@@ -34,6 +34,8 @@ def test_a_wall_is_gone_around():
     assert points[:, 1].max() > 1.0
     # Tested every 0.03 rad: corners may be cut by half of that.
     assert min(max(abs(x) - 0.3, y - 1.0) for x, y in points) > -0.03
+    finer = dense(connect(START, GOAL, *LIMITS, beside_a_wall, 1, resolution=0.005))
+    assert min(max(abs(x) - 0.3, y - 1.0) for x, y in finer) > -0.005
     length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
     assert 2.7 < length < 5  # at least around both corners: 2 * hypot(0.7, 1) + 0.6
 

@@ -1,0 +1,172 @@
+"""How many reachable tasks the planner solves, and in what time, with the true pick and the true release.
+
+A task is reachable if the arm has postures without collision at the pick and at the release, by a search of its own:
+mink from random starts, where the planner has its own damped least squares. Starts that are not reachable are
+drawn again, and every task that is drawn counts.
+
+python -m tdf_jax.sim.motion_study --episodes 20
+"""
+
+import argparse
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from tdf_jax._internal.files import replace_file
+from tdf_jax.evaluation.statistics import bootstrap_interval
+from tdf_jax.evaluation.tables import between, markdown, percent
+from tdf_jax.sim.collision import Collisions
+from tdf_jax.sim.kinematics import kinematics_of
+from tdf_jax.sim.motion import Failure, plan_motion
+from tdf_jax.sim.posture import HALF_TURN
+from tdf_jax.sim.robot import Robot, load_robot
+from tdf_jax.sim.tasks import POSES, TASKS, Episode, draw_episode, true_path
+from tdf_jax.sim.workcell import build_workcell
+
+SEARCHES, ITERATIONS = 120, 40  # random starts at each end, and steps from each
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """A task, and what the planner made of it.
+
+    Attributes:
+        task: name of the task.
+        poses: how the object starts.
+        number: number of the episode.
+        rejected: number of starts drawn before that are not reachable.
+        solved: whether there is a motion.
+        reason: why there is none; empty otherwise.
+        seconds: processor time of the planner, seconds.
+    """
+
+    task: str
+    poses: str
+    number: int
+    rejected: int
+    solved: bool
+    reason: str
+    seconds: float
+
+
+def reachable(episode: Episode, robot: Robot, collisions: Collisions) -> bool:
+    """Whether the arm has postures without collision at the true pick and the true release, by random restarts.
+
+    Args:
+        episode: the episode.
+        robot: the robot.
+        collisions: of a cell with the episode's bodies, the target free.
+    """
+    placed = episode.T_world_target @ episode.T_target_object
+    kinematics, rng = kinematics_of(robot), np.random.default_rng(episode.number)
+    for T, T_object, meet in (
+        (episode.pick, episode.T_world_object, {"object", "table"}),
+        (episode.release, placed, {"object", "target"}),
+    ):
+        for number in range(SEARCHES):
+            start = rng.uniform(np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi))
+            joints = kinematics.solve(T @ HALF_TURN if number % 2 else T, start, ITERATIONS)
+            if joints is None:
+                continue
+            depths = collisions.depths(joints, episode.grip.opening, T_object, episode.T_world_target)
+            if all(set(pair) in (meet, {"target", "table"}, {"hand"}) for pair in depths):
+                break
+        else:
+            return False
+    return True
+
+
+def plan_task(robot: Robot, task: str, poses: str, seed: int, number: int) -> Row:
+    """Draw a task, and plan its true trajectory.
+
+    Args:
+        robot: the robot.
+        task: name of the task.
+        poses: how the object starts.
+        seed: seed of the tasks.
+        number: number of the task.
+    """
+    episode = draw_episode(task, robot, seed, number, poses, reachable=reachable)
+    path = np.asarray(true_path(episode).matrices, float)
+    cell = build_workcell(
+        robot,
+        episode.object_body,
+        episode.T_world_object,
+        episode.target_body,
+        episode.T_world_target,
+        fixture=episode.fixture,
+        fixed_target=TASKS[task].fixed,
+    )
+    begun = time.process_time()
+    plan = plan_motion([path], robot, openings=[episode.grip.opening], grip=0.0, cell=cell)
+    seconds = time.process_time() - begun
+    failed = isinstance(plan, Failure)
+    return Row(
+        task, poses, number, episode.rejected, not failed, plan.reason if isinstance(plan, Failure) else "", seconds
+    )
+
+
+def table_of(rows: Sequence[Row]) -> str:
+    """A table of the share solved with intervals, and of the times, by task and start.
+
+    Args:
+        rows: the tasks.
+    """
+    lines = []
+    keys = list(dict.fromkeys((row.task, row.poses) for row in rows))
+    for key in [*keys, ("all", "")]:
+        of = [row for row in rows if key in ((row.task, row.poses), ("all", ""))]
+        solved = np.array([row.solved for row in of], float)
+        seconds = np.array([row.seconds for row in of])
+        lines.append(
+            [
+                " ".join(key).strip().replace("_", " "),
+                str(len(of)),
+                percent(float(solved.mean())) + between(bootstrap_interval(solved, range(len(of)))),
+                f"{np.median(seconds):.2f} s",
+                f"{np.percentile(seconds, 90):.2f} s",
+            ]
+        )
+    return markdown(["task", "tasks", "solved", "planner, median", "90 % are below"], lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Plan all tasks, and print the share solved, the times and the reasons of failures.
+
+    Args:
+        arguments: words of the command line; by default those of the process.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m tdf_jax.sim.motion_study", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument("--episodes", type=int, default=10, help="number of tasks of each kind and start (default: 10)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the tasks (default: 0)")
+    parser.add_argument("--tasks", nargs="*", default=list(TASKS), choices=TASKS, help="tasks (default: all)")
+    parser.add_argument("--poses", nargs="*", default=["upright", "tilt60"], choices=POSES, help="how objects start")
+    parser.add_argument("--robot", type=Path, help="MJCF of another arm with a parallel gripper")
+    parser.add_argument("--site", help="site of that file that is the gripper's frame")
+    parser.add_argument("--out", type=Path, help="file for the rows of all tasks (default: none)")
+    settings = parser.parse_args(arguments)
+    if settings.episodes < 1 or settings.seed < 0:
+        parser.error("--episodes must be at least 1, and --seed at least 0")
+    robot, rows = load_robot(settings.robot, settings.site), []
+    for task in settings.tasks:
+        for poses in settings.poses:
+            for number in range(settings.episodes):
+                row = plan_task(robot, task, poses, settings.seed, number)
+                rows.append(row)
+                if not row.solved:
+                    print(f"{task} {poses} {number}: {row.reason}", flush=True)
+            print(f"{task} {poses}: {settings.episodes} tasks", file=sys.stderr, flush=True)
+    print(table_of(rows))
+    if settings.out is not None:
+        replace_file("motion_study", settings.out, json.dumps([dataclasses.asdict(row) for row in rows]).encode())
+
+
+if __name__ == "__main__":
+    main()

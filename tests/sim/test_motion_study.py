@@ -1,0 +1,57 @@
+"""The study of the planner: its search for postures against the draws' own, its table, and one task end to end."""
+
+import dataclasses
+import json
+
+import pytest
+
+from tdf_jax.sim import motion_study
+from tdf_jax.sim.collision import Collisions
+from tdf_jax.sim.motion_study import Row, main, plan_task, reachable, table_of
+from tdf_jax.sim.workcell import build_workcell
+
+
+def of(episode, robot):
+    return Collisions(build_workcell(robot, episode.object_body, None, episode.target_body, None, fixed_target=False))
+
+
+def test_what_the_draws_reach_is_reachable_and_what_is_far_or_in_the_table_is_not(robot, drawn):
+    episode = drawn("bowl_on_shelf")
+    collisions = of(episode, robot)
+    assert reachable(episode, robot, collisions)
+
+    for move in ((1.5, 0, 0), (0, 0, -0.15)):
+        T = episode.T_world_target.copy()
+        T[:3, 3] += move
+        assert not reachable(dataclasses.replace(episode, T_world_target=T), robot, collisions)
+
+
+@pytest.mark.slow
+def test_a_task_is_planned(robot):
+    row = plan_task(robot, "bowl_on_shelf", "upright", 900, 0)
+    assert row.solved and not row.reason and row.seconds > 0 and (row.task, row.number) == ("bowl_on_shelf", 0)
+
+
+def test_the_table_has_shares_and_times_of_each_task_and_of_all():
+    rows = [Row("mug_on_rack", "upright", n, 0, n > 0, "" if n else "no", float(n)) for n in range(4)]
+    lines = table_of([*rows, Row("bowl_on_mug", "tilt60", 0, 0, True, "", 9.0)]).splitlines()
+    assert lines[2].startswith("| mug on rack upright | 4 | 75 % (25 to 100) | 1.50 s |")
+    assert lines[3].startswith("| bowl on mug tilt60 | 1 | 100 % | 9.00 s |") and lines[4].startswith(
+        "| all | 5 | 80 %"
+    )
+
+
+def test_the_command_says_reasons_and_refuses_nothing_to_do(monkeypatch, capsys, tmp_path):
+    def planned(robot, task, poses, seed, number):
+        return Row(task, poses, number, 0, number > 0, "" if number else "the reason", 0.5)
+
+    monkeypatch.setattr(motion_study, "plan_task", planned)
+    monkeypatch.setattr(motion_study, "load_robot", lambda file, site: None)
+    main(["--episodes", "2", "--tasks", "bowl_on_mug", "--poses", "tilt60", "--out", str(tmp_path / "rows.json")])
+    printed = capsys.readouterr().out
+    assert "bowl_on_mug tilt60 0: the reason" in printed and "| all | 2 | 50 % (0 to 100) | 0.50 s |" in printed
+    rows = json.loads((tmp_path / "rows.json").read_text())
+    assert [row["solved"] for row in rows] == [False, True] and set(rows[0]) == set(Row.__annotations__)
+    for words in (["--episodes", "0"], ["--seed", "-1"], ["--tasks", "nothing"]):
+        with pytest.raises(SystemExit):
+            main(words)
