@@ -10,13 +10,16 @@ from tdf_jax.sim.joint_trajectory import JointTrajectory
 from tdf_jax.sim.physics import TIMESTEP, extra
 from tdf_jax.sim.workcell import Workcell
 
+SLOW = 0.01  # rad/s, below which a joint's friction is compensated in part: its sign is not known at rest
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Controller:
     """Drives a robot's actuators along a trajectory.
 
     The command of a position actuator is the planned position, with what it takes to keep up: the damping times the
-    planned velocity and the arm's inertia times the planned acceleration, over the actuator's stiffness. Without it the
+    planned velocity, the joints' friction and the arm's inertia times the planned acceleration, over the actuator's
+    stiffness. Without it the
     UR5e's model, by its damping over its stiffness, would be 0.2 s behind. Gravity on the arm itself is compensated
     (`tdf_jax.sim.robot`), that on what it holds is not.
 
@@ -25,7 +28,9 @@ class Controller:
         motion: the trajectory.
         table: what is planned for every step of the physics, by name: position, velocity and acceleration of the
             joints, (steps, joints), and opening, (steps,).
-        stiffness, damping: of the arm's actuators, (joints,).
+        stiffness: of the arm's actuators, (joints,).
+        damping: of the actuators and the joints, (joints,).
+        friction: of the joints, whatever their velocity, (joints,), newton metres.
     """
 
     cell: Workcell
@@ -33,6 +38,7 @@ class Controller:
     table: dict[str, np.ndarray] = dataclasses.field(init=False)
     stiffness: np.ndarray = dataclasses.field(init=False)
     damping: np.ndarray = dataclasses.field(init=False)
+    friction: np.ndarray = dataclasses.field(init=False)
 
     def __post_init__(self):
         """Sample the trajectory at every step of the physics."""
@@ -53,7 +59,9 @@ class Controller:
         model = self.cell.model
         arm = self.cell.arm_actuators
         object.__setattr__(self, "stiffness", model.actuator_gainprm[arm, 0].copy())
-        object.__setattr__(self, "damping", -model.actuator_biasprm[arm, 2])
+        dofs = self.cell.arm_dofs
+        object.__setattr__(self, "damping", -model.actuator_biasprm[arm, 2] + model.dof_damping[dofs])
+        object.__setattr__(self, "friction", model.dof_frictionloss[dofs].copy())
 
     @property
     def num_steps(self) -> int:
@@ -68,7 +76,8 @@ class Controller:
         wanted, inertia = np.zeros(model.nv), np.zeros(model.nv)
         wanted[cell.arm_dofs] = table["acceleration"][step]
         mujoco.mj_mulM(model, data, inertia, wanted)
-        ahead = self.damping * table["velocity"][step] + inertia[cell.arm_dofs]
+        velocity = table["velocity"][step]
+        ahead = self.damping * velocity + inertia[cell.arm_dofs] + self.friction * np.tanh(velocity / SLOW)
         data.ctrl[cell.arm_actuators] = table["position"][step] + ahead / self.stiffness
         data.ctrl[cell.finger_actuator] = cell.fingers.command(float(table["opening"][step]))
 

@@ -31,6 +31,7 @@ DEPARTURE, ARRIVAL = 0.08, 0.12  # metres of the path that are followed even whe
 # with which departures are half as long: near the ends of the arm's reach it can leave straight by 3 cm and not by 5.
 SHORTER, SHORTEST = (1.0, 0.5), 0.25
 NARROW = 0.008  # radians between tested positions of free motions from ends that are so near
+LIFT = 0.04  # metres straight up from the pick, where neither the whole path nor its ends can be followed without
 MOST_POSTURES = 4  # postures tried at either end then
 # Penetrations that a plan may have, metres. Clouds and fields know surfaces to a millimetre or two.
 TOUCHING = 0.002
@@ -160,8 +161,9 @@ def plan_motion(
     reasons: list[tuple[int, str]] = []
     for number, (poses, opening) in enumerate(zip(candidates, openings, strict=True)):
         halves = np.eye(4), HALF_TURN
-        for half, share in (*itertools.product(halves, SHORTER), *itertools.product(halves, [SHORTEST])):
-            turned = np.asarray(poses, float) @ half
+        variants = *itertools.product([0.0], halves, SHORTER), *itertools.product([0.0, LIFT], halves, [SHORTEST])
+        for lift, half, share in variants:
+            turned = _lifted(np.asarray(poses, float) @ half, lift)
             path = _Path(turned, share * approach)
             ends = min(1.0, 2 * share) * DEPARTURE, share * ARRIVAL
             ways = _ways(postures, collisions, path, opening, ends, seed, reasons)
@@ -177,6 +179,15 @@ def plan_motion(
     if not reasons:
         return Failure("the pick has no posture of the arm within its limits: it is out of reach")
     return Failure(max(reasons)[1])
+
+
+def _lifted(poses: np.ndarray, lift: float) -> np.ndarray:
+    """A path that begins with a straight lift, metres: one that tilts what it picks at once would hit the table."""
+    if not lift or len(poses) < 2:
+        return poses
+    above = poses[0].copy()
+    above[2, 3] += lift
+    return np.concatenate([poses[:1], above[None], poses[1:]])
 
 
 class _Path:

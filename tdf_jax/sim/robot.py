@@ -6,6 +6,7 @@ the closing direction, the origin midway between the fingertips.
 
 import dataclasses
 import functools
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from jaxtyping import Float
 from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import host
 from tdf_jax._internal.errors import InputError
+from tdf_jax.sim.grip_site import site_hint
 from tdf_jax.sim.physics import TIMESTEP, compiled, extra, set_options
 
 PREFIX = "robot/"  # of the names of the robot's parts in a cell
@@ -33,6 +35,7 @@ ASIDE = (0.0, -0.006, 0.006)  # metres along x from the site: where there are ra
 ROUNDING = 1e-6  # metres
 LEAST_ROWS = 3  # heights with the same gap that are pads: less is an edge
 GROOVE = 6  # heights that a groove across the pads may have
+THIN, WEAK = 0.005, 5.0  # metres of a wall, and newtons that a grasp of it needs: friction holds 0.7 kg with them
 LEVEL = 0.0005  # metres by which the gap may differ from one height to the next on pads, which may lean a little
 
 
@@ -46,6 +49,8 @@ class Fingers:
         depths: middle of the pads along the approach from the site, (commands,), metres. The pads of the 2F-85 move
             along the approach as it closes.
         tips: tips of the pads along the approach from the site, (commands,), metres.
+        forces: force of each pad on what keeps the fingers that far open when they are told to close, (commands,),
+            newtons.
         joints: names of the fingers' joints.
         positions: their positions, (commands, joints), radians or metres.
     """
@@ -54,6 +59,7 @@ class Fingers:
     openings: Float[np.ndarray, " commands"]
     depths: Float[np.ndarray, " commands"]
     tips: Float[np.ndarray, " commands"]
+    forces: Float[np.ndarray, " commands"]
     joints: tuple[str, ...]
     positions: Float[np.ndarray, "commands joints"]
 
@@ -65,6 +71,10 @@ class Fingers:
     def command(self, opening: float) -> float:
         """The value of the actuator for an opening, metres; beyond its range the nearest one."""
         return float(np.interp(opening, self.openings[::-1], self.commands[::-1]))
+
+    def force(self, opening: float) -> float:
+        """Force of each pad on what keeps the fingers open to an opening, metres, when they are told to close."""
+        return float(np.interp(opening, self.openings[::-1], self.forces[::-1]))
 
     def joint_positions(self, opening: float) -> Float[np.ndarray, " joints"]:
         """Positions of the fingers' joints at an opening, metres."""
@@ -197,9 +207,10 @@ def load_robot(
         raise InputError(f"load_robot(): {files[0]} does not compile ({error}); expected a valid MJCF") from None
     sites = [model.site(number).name for number in range(model.nsite)]
     if site not in sites:
+        hint = site_hint(model)
         raise InputError(
             f"load_robot(): {files[0]} has no site {site!r}; it has {', '.join(filter(None, sites)) or 'none'}. Name "
-            "the site of the gripper's frame"
+            "the site of the gripper's frame" + (f", or add {hint} and check it with the drawing" if hint else "")
         )
     joints = _chain(mujoco, model, site, files[0])
     by_joint = {
@@ -326,7 +337,32 @@ def _calibrated(robot: Robot) -> Fingers:
             f"load_robot(): the gap at the site {robot.site!r} is {np.round(openings, 4)} m from command to command; "
             "expected two fingers on both sides along the site's y axis, whose actuator closes them"
         )
-    return Fingers(commands.copy(), openings.copy(), depths.copy(), tips.copy(), tuple(others), np.array(positions))
+    forces = _forces(mujoco, model, data, fingers.id, others, commands[-1], openings, np.array(positions))
+    found = Fingers(
+        commands.copy(), openings.copy(), depths.copy(), tips.copy(), forces, tuple(others), np.array(positions)
+    )
+    if found.force(THIN) < WEAK:
+        warnings.warn(
+            f"load_robot(): the fingers of {robot.name} press with {found.force(THIN):.1f} N on something "
+            f"{1e3 * THIN:.0f} mm wide, from which objects slip; expected {WEAK:.0f} N. Raise the stiffness of the "
+            f"actuator {robot.finger_actuator!r} in {robot.files[-1].name}, and limit it by a forcerange",
+            stacklevel=2,
+        )
+    return found
+
+
+def _forces(mujoco, model, data, actuator: int, joints, closed: float, openings, positions) -> np.ndarray:
+    """Forces of the pads at openings, by virtual work: the actuator's force times its length over the opening."""
+    lengths, pulls = [], []
+    for row in positions:
+        for name, position in zip(joints, row):
+            data.joint(name).qpos = position
+        data.qvel[:] = 0
+        data.ctrl[actuator] = closed
+        mujoco.mj_forward(model, data)
+        lengths.append(data.actuator_length[actuator])
+        pulls.append(data.actuator_force[actuator])
+    return np.array(pulls) * np.gradient(lengths, openings) * -1.0
 
 
 def _gap(mujoco, model, data, site: str) -> tuple[float, float, float]:
