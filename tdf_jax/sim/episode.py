@@ -12,7 +12,7 @@ from tdf_jax.evaluation.relation_success import UPRIGHT, hole_is_crossed
 from tdf_jax.geometry.symmetry import ROUND
 from tdf_jax.shapes import Mug, Rack
 from tdf_jax.sim.collision import ARM, HAND_KIND, OBJECT_KIND, TABLE_KIND, TARGET_KIND, geom_kinds
-from tdf_jax.sim.execution import execute
+from tdf_jax.sim.execution import Payload, execute
 from tdf_jax.sim.grasping import MOST_SLIP, MOST_TURN, test_grasp
 from tdf_jax.sim.motion import Failure, plan_motion
 from tdf_jax.sim.physics import TIMESTEP, extra
@@ -207,7 +207,8 @@ def run_episode(
         return Outcome.failure("pick wrong" if wrong else "unreachable", wrong or plan.reason)
     data = cell.data()
     observer = _Observer(cell, watch, noted)
-    execute(cell, data, plan.motion, observer)
+    centre = np.linalg.inv(plan.pick) @ episode.T_world_object @ np.append(episode.object_body.centre, 1.0)
+    execute(cell, data, plan.motion, observer, Payload(episode.object_body.mass, centre[:3]))
     contacts = settle(cell, data)
     observer.note(data, "end")
     placed, cause, detail, criteria = _judged(episode, cell, data, contacts)

@@ -5,12 +5,27 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from tdf_jax.sim.joint_trajectory import JointTrajectory
 from tdf_jax.sim.physics import TIMESTEP, extra
 from tdf_jax.sim.workcell import Workcell
 
+RAMP = 0.2  # seconds in which the weight of a payload is taken up, and let go
 SLOW = 0.01  # rad/s, below which a joint's friction is compensated in part: its sign is not known at rest
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Payload:
+    """What a controller is told of what the hand will hold.
+
+    Attributes:
+        mass: mass, kg.
+        centre: centre of mass, (3,), metres, in the gripper's frame.
+    """
+
+    mass: float
+    centre: Float[np.ndarray, "3"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -19,15 +34,16 @@ class Controller:
 
     The command of a position actuator is the planned position, with what it takes to keep up: the damping times the
     planned velocity, the joints' friction and the arm's inertia times the planned acceleration, over the actuator's
-    stiffness. Without it the
-    UR5e's model, by its damping over its stiffness, would be 0.2 s behind. Gravity on the arm itself is compensated
-    (`tdf_jax.sim.robot`), that on what it holds is not.
+    stiffness. Without it the UR5e's model, by its damping over its stiffness, would be 0.2 s behind. Gravity on the arm
+    itself is compensated (`tdf_jax.sim.robot`), that on what it holds only if the controller is told of it.
 
     Attributes:
         cell: the cell, with the arm.
         motion: the trajectory.
-        table: what is planned for every step of the physics, by name: position, velocity and acceleration of the
-            joints, (steps, joints), and opening, (steps,).
+        payload: what is held along the path, whose weight is then compensated; nothing by default.
+        table: what is planned for every step of the physics, by name: position at its begin, and velocity and
+            acceleration at its end, of the joints, (steps, joints); opening, and the share of the payload that is
+            held, (steps,).
         stiffness: of the arm's actuators, (joints,).
         damping: of the actuators and the joints, (joints,).
         friction: of the joints, whatever their velocity, (joints,), newton metres.
@@ -35,6 +51,7 @@ class Controller:
 
     cell: Workcell
     motion: JointTrajectory
+    payload: Payload | None = None
     table: dict[str, np.ndarray] = dataclasses.field(init=False)
     stiffness: np.ndarray = dataclasses.field(init=False)
     damping: np.ndarray = dataclasses.field(init=False)
@@ -43,18 +60,25 @@ class Controller:
     def __post_init__(self):
         """Sample the trajectory at every step of the physics."""
         times, q = self.motion.times, self.motion.positions
-        # What is planned for the end of a step, which is where its command leads.
-        at = np.minimum(np.arange(1, int(round(self.motion.duration / TIMESTEP)) + 2) * TIMESTEP, times[-1])
+        # The engine integrates velocities implicitly, but takes positions as they are at the begin of a step: with
+        # those at its end the arm is a step early.
+        ends = np.minimum(np.arange(int(round(self.motion.duration / TIMESTEP)) + 2) * TIMESTEP, times[-1])
+        begin, at = ends[:-1], ends[1:]
         from scipy.interpolate import CubicSpline
 
         spline = CubicSpline(times, q, bc_type="clamped") if len(times) > 1 else None
         zero = np.zeros((len(at), q.shape[1]))
         table = {
-            "position": zero + q[0] if spline is None else spline(at),
+            "position": zero + q[0] if spline is None else spline(begin),
             "velocity": zero if spline is None else spline(at, 1),
             "acceleration": zero if spline is None else spline(at, 2),
             "opening": np.interp(at, times, self.motion.gripper),
+            "held": np.zeros(len(at)),
         }
+        phases = self.motion.segment_slices()
+        if "path" in phases:
+            lifted, placed = times[phases["path"].start], times[phases["path"].stop - 1]
+            table["held"] = np.clip(np.minimum(at - lifted, placed + RAMP - at) / RAMP, 0.0, 1.0)
         object.__setattr__(self, "table", table)
         model = self.cell.model
         arm = self.cell.arm_actuators
@@ -78,6 +102,13 @@ class Controller:
         mujoco.mj_mulM(model, data, inertia, wanted)
         velocity = table["velocity"][step]
         ahead = self.damping * velocity + inertia[cell.arm_dofs] + self.friction * np.tanh(velocity / SLOW)
+        if self.payload is not None and table["held"][step]:
+            T = cell.gripper_pose(data)
+            moves = np.zeros((3, model.nv))
+            body = int(model.site_bodyid[cell.site])
+            mujoco.mj_jac(model, data, moves, None, T[:3, :3] @ self.payload.centre + T[:3, 3], body)
+            weight = table["held"][step] * self.payload.mass * model.opt.gravity
+            ahead = ahead - moves[:, cell.arm_dofs].T @ weight
         data.ctrl[cell.arm_actuators] = table["position"][step] + ahead / self.stiffness
         data.ctrl[cell.finger_actuator] = cell.fingers.command(float(table["opening"][step]))
 
@@ -87,6 +118,7 @@ def execute(
     data: Any,
     motion: JointTrajectory,
     watch: Callable[[Any, int, str], None] | None = None,
+    payload: Payload | None = None,
 ) -> None:
     """Run the physics along a trajectory; the state is where it ends.
 
@@ -95,9 +127,10 @@ def execute(
         data: its state, which changes.
         motion: the trajectory.
         watch: called after every step with the state, the number of the step and the phase.
+        payload: what the controller is told of what the hand will hold.
     """
     mujoco = extra("execute()", "mujoco")
-    controller = Controller(cell, motion)
+    controller = Controller(cell, motion, payload)
     starts = [(name, motion.times[first]) for name, first in motion.segments] or [("", 0.0)]
     phase = 0
     for step in range(controller.num_steps):
