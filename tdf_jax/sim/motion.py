@@ -35,6 +35,7 @@ LIFT = 0.04  # metres straight up from the pick, where neither the whole path no
 MOST_POSTURES = 4  # postures tried at either end then
 # Penetrations that a plan may have, metres. Clouds and fields know surfaces to a millimetre or two.
 TOUCHING = 0.002
+ITSELF = 0.0  # of the robot with itself, whose shape is known: with an overlap of 1 mm the arm got stuck at its wrist
 RESTING = 0.006  # of the object and what it stands on or is placed on, near both ends
 ENDS = 0.08  # metres from an end in which the object may touch its support or the target
 
@@ -326,7 +327,7 @@ def _blocked(collisions: Collisions | None, path: _Path, joints, rows, opening: 
                 continue
             if "object" in pair and "hand" in pair and held:
                 continue
-            allowed = TOUCHING
+            allowed = ITSELF if pair <= {"arm", "hand"} else TOUCHING
             if pair in ({"object", "table"}, {"object", "target"}):
                 allowed = np.inf if not held else (RESTING if row in near else TOUCHING)
             if depth > allowed:
@@ -345,7 +346,10 @@ def _free(collisions: Collisions, opening: float, kinematics: Kinematics | None 
     def free(positions) -> bool:
         T = T_object if kinematics is None or T_object is None else kinematics.pose(positions) @ T_object
         depths = collisions.depths(positions, opening, T)
-        return all(depth <= TOUCHING or pair in passed for pair, depth in depths.items())
+        return all(
+            pair in passed or depth <= (ITSELF if set(pair) <= {"arm", "hand"} else TOUCHING)
+            for pair, depth in depths.items()
+        )
 
     return free
 

@@ -9,7 +9,7 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.sim.board import Board
 from tdf_jax.sim.bodies import body_of
 from tdf_jax.sim.kinematics import kinematics_of
-from tdf_jax.sim.motion import APPROACH, CARRYING, SHORTEST, Failure, plan_motion
+from tdf_jax.sim.motion import APPROACH, CARRYING, SHORTEST, Failure, _free, plan_motion
 from tdf_jax.sim.workcell import OBJECT, build_workcell
 
 PHASES = ["transit", "approach", "grasp", "path", "release", "retreat", "return"]
@@ -171,6 +171,20 @@ def test_near_the_end_of_its_reach_the_arm_leaves_as_far_as_it_can(robot, corner
 
 def any_posture(kinematics, T, starts):
     return any(kinematics.search(T, start) is not None for start in starts)
+
+
+def test_the_robot_may_not_overlap_with_itself_and_a_cloud_may_by_a_millimetre():
+    """Shapes of the robot are known: where its links overlapped by 1 mm in a plan, the arm got stuck in physics."""
+
+    class Overlap:
+        def __init__(self, *pair):
+            self.pair = pair
+
+        def depths(self, joints, opening, T_object):
+            return {self.pair: 0.001}
+
+    for pair, passes in ((("arm", "hand"), False), (("arm", "arm"), False), (("arm", "target"), True)):
+        assert _free(Overlap(*pair), 0.05)(np.zeros(6)) is passes
 
 
 @pytest.mark.slow
