@@ -3,6 +3,7 @@
 Modules:
     physics: settings of the physics in one place, and the import of the engine
     robot: an arm and a gripper, from a package or from a file
+    grip_site: the site of the gripper's frame that a model lacks
     board: a board at a height, the shelf of the tasks
     bodies: rigid bodies of generated objects
     decomposition: convex parts of users' meshes, and the bodies that they make
@@ -18,6 +19,7 @@ Modules:
     joint_trajectory: a timed motion of the joints, and its files
     retiming: times of a path of the joints within limits of velocity and acceleration
     motion: motions of a robot along a trajectory, from home to home
+    motion_study: how many reachable tasks the planner solves, and in what time
     execution: a joint trajectory in physics
     pads: flat pads, and the turn at which what they clamp lies flush with them
     necks: how pads hold a neck, and a neck in a cloud

@@ -319,18 +319,19 @@ def _calibrated(robot: Robot) -> Fingers:
     commands = np.linspace(first, last, COMMANDS)
     others = [model.joint(number).name for number in range(model.njnt)]
     others = [name for name in others if name not in robot.joints]
-    rows, positions = [], []
+    rows, positions, touching = [], [], []
     for command in commands:
         data.ctrl[fingers.id] = command
         for _ in range(int(SETTLE / TIMESTEP)):
             mujoco.mj_step(model, data)
         rows.append(_gap(mujoco, model, data, robot.site))
+        touching.append(_pads_touch(model, data, robot.site))
         positions.append([float(data.joint(name).qpos[0]) for name in others])
     openings, depths, tips = np.array(rows).T
     if openings[0] < openings[-1]:  # the largest command opens
         commands, openings, positions = commands[::-1], openings[::-1], positions[::-1]
-        depths, tips = depths[::-1], tips[::-1]
-    if openings[-2] < CLOSED and not openings[-1] < openings[-2]:
+        depths, tips, touching = depths[::-1], tips[::-1], touching[::-1]
+    if touching[-1] or (openings[-2] < CLOSED and not openings[-1] < openings[-2]):
         openings[-1], depths[-1], tips[-1] = 0.0, depths[-2], tips[-2]  # the pads touch: a ray begins in one of them
     if not np.isfinite(openings).all() or not (np.diff(openings) < 0).all():
         raise InputError(
@@ -390,3 +391,13 @@ def _gap(mujoco, model, data, site: str) -> tuple[float, float, float]:
     while (again := np.flatnonzero(np.abs(gaps[end : end + GROOVE] - gap) <= LEVEL)).size:  # beyond a groove
         end += int(again[-1]) + 1
     return gap, float(heights[tip:end].mean()), float(heights[tip])
+
+
+def _pads_touch(model, data, site: str) -> bool:
+    """Whether what is on one side of the site along its y axis touches what is on the other."""
+    frame = data.site(site)
+    for pair in data.contact.geom[: data.ncon]:
+        sides = (data.xipos[model.geom_bodyid[pair]] - frame.xpos) @ frame.xmat.reshape(3, 3)[:, 1]
+        if sides.min() < 0 < sides.max():
+            return True
+    return False

@@ -46,7 +46,7 @@ PARTS = {
     "left": FINGER.format(name="left", side=1, offset=0.005),
     "right": FINGER.format(name="right", side=-1, offset=-0.005),
     "first": '<position name="A" joint="a" kp="500" kv="50"/>',
-    "fingers": '<position name="squeeze" joint="left" kp="300" kv="5" ctrlrange="0 .04"/>',
+    "fingers": '<position name="squeeze" joint="left" kp="9000" kv="50" ctrlrange="0 .04"/>',
     "key": '<keyframe><key name="home" qpos=".3 .2 .1 0 0"/></keyframe>',
 }
 
