@@ -363,7 +363,8 @@ def _forces(mujoco, model, data, actuator: int, joints, closed: float, openings,
         mujoco.mj_forward(model, data)
         lengths.append(data.actuator_length[actuator])
         pulls.append(data.actuator_force[actuator])
-    return np.array(pulls) * np.gradient(lengths, openings) * -1.0
+    slopes = np.gradient(lengths[:-1], openings[:-1])  # the opening of closed fingers is not exact
+    return -np.array(pulls) * np.append(slopes, slopes[-1])
 
 
 def _gap(mujoco, model, data, site: str) -> tuple[float, float, float]:
