@@ -59,6 +59,11 @@ def view(
         return
     if scale != 1:
         raise InputError("tdf view: --scale is for an object with --demonstrate; give that, or drop --scale")
+    if folder.is_file() and folder.suffix != ".npz":
+        raise InputError(
+            f"tdf view: {folder} is a file; expected a folder of `tdf imitate` or `tdf landscape`. To make a "
+            "demonstration on an object, add --demonstrate FILE"
+        )
     alone = not (folder / SCENE).exists() and (folder / "landscape.npz").is_file()
     if alone and landscape is not None:
         raise InputError(f"tdf view: {folder} is a landscape, and there is --landscape {landscape}; drop one")

@@ -114,8 +114,8 @@ class HandStage:
         size = float(np.linalg.norm(np.ptp(self.points, axis=0)))
         middle = self.points.mean(axis=0)
         self._object = server.scene.add_frame("/object", show_axes=False)
-        handles.add_cloud(server, "/object/cloud", self.points, COLOURS(0.0))
-        handles.add_mesh(server, "/object/mesh", mesh)
+        if handles.add_mesh(server, "/object/mesh", mesh) is None:
+            handles.add_cloud(server, "/object/cloud", self.points, COLOURS(0.0))
         self._grip = server.scene.add_transform_controls(
             "/box", scale=GRIP * size, line_width=3.0, depth_test=False, position=middle
         )

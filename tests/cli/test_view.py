@@ -74,6 +74,7 @@ def test_an_object_is_shown_to_demonstrate_on(tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "demo.npz").exists()
     assert "expected a new .npz file" in refusal(capsys, tmp_path / "mug.obj", "--demonstrate", tmp_path / "demo.txt")
     assert "drop them" in refusal(capsys, tmp_path / "mug.obj", *words[:2], "--weights", "mug")
+    assert "To make a demonstration on an object, add --demonstrate" in refusal(capsys, tmp_path / "mug.obj")
     assert "drop --scale" in refusal(capsys, tmp_path, "--scale", "0.01")
 
 
