@@ -176,6 +176,14 @@ CALLS = {
     "load_demonstration": lambda w: dataclasses.astuple(
         saved(w, "d.npz", lambda path: tdf.save_demonstration(path, w.demonstration), tdf.load_demonstration)
     ),
+    "load_imitation": lambda w: (lambda scene: (scene.points, scene.result.trajectories, scene.demonstration.query))(
+        saved(
+            w,
+            "i.npz",
+            lambda path: tdf.save_imitation(path, tdf.ImitationScene(w.demonstration, w.points, w.result)),
+            tdf.load_imitation,
+        )
+    ),
     "load_joint_trajectory": lambda w: (lambda read: (read.times, read.positions, read.gripper))(
         saved(
             w,
@@ -245,6 +253,7 @@ CALLS = {
 NO_CALL = {
     "available_models": "lists file names",
     "save_demonstration": "by load_demonstration",
+    "save_imitation": "by load_imitation",
     "save_landscape": "by load_landscape",
     "save_model": "by load_model",
     "save_trajectory": "by load_trajectory",
@@ -413,6 +422,7 @@ REFUSED = {
     "gripper_query": (lambda w, x: tdf.gripper_query(KEY, 4, finger=x), "vector"),
     "hang_on_rack": (lambda w, x: tdf.hang_on_rack(4, approach=x), "vector"),
     "JointTrajectory": (lambda w, x: tdf.JointTrajectory(x, w.axes, ("a", "b", "c"), w.openings), "steps"),
+    "ImitationScene": (lambda w, x: tdf.ImitationScene(w.demonstration, x, w.result), "shown"),
     "imitate": (lambda w, x: tdf.imitate(w.model, w.demonstration, x, key=KEY, config=CARRY), "shown"),
     "imitate_batch": (lambda w, x: tdf.imitate_batch(w.model, w.demonstration, [x], key=KEY, config=CARRY), "shown"),
     "lift_over": (lambda w, x: tdf.lift_over(4, start=x), "vector"),
@@ -447,6 +457,7 @@ NOT_TRACED = {
     *("Demonstration", "Grid", "Landscape", "Result", "Target", "build_bottle", "build_bowl", "build_container"),
     *("build_mug", "build_rack", "convert_checkpoint", "load_demonstration", "load_landscape", "load_mesh"),
     *(
+        "load_imitation",
         "load_joint_trajectory",
         "load_model",
         "load_points",
