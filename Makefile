@@ -16,7 +16,7 @@ test: $(VENV)/.installed-test
 	$(PYTEST) -m "not slow"
 
 test-all: $(VENV)/.installed-dev
-	TDF_BROWSER=required $(PYTEST) -rs
+	TDF_BROWSER=$${TDF_BROWSER-required} $(PYTEST) -rs
 
 # Annotations of arguments and results of these packages are checked as their functions run, shapes included.
 TYPED := geometry io networks energy landscape shapes
