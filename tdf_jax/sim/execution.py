@@ -41,7 +41,7 @@ class Controller:
         cell: the cell, with the arm.
         motion: the trajectory.
         payload: what is held along the path, whose weight is then compensated; nothing by default.
-        table: what is planned for every step of the physics, by name: position at its begin, and velocity and
+        table: what is planned for every step of the physics, by name: position at its start, and velocity and
             acceleration at its end, of the joints, (steps, joints); opening, and the share of the payload that is
             held, (steps,).
         stiffness: of the arm's actuators, (joints,).
@@ -60,7 +60,7 @@ class Controller:
     def __post_init__(self):
         """Sample the trajectory at every step of the physics."""
         times, q = self.motion.times, self.motion.positions
-        # The engine integrates velocities implicitly, but takes positions as they are at the begin of a step: with
+        # The engine integrates velocities implicitly, but takes positions as they are at the start of a step: with
         # those at its end the arm is a step early.
         ends = np.minimum(np.arange(int(round(self.motion.duration / TIMESTEP)) + 2) * TIMESTEP, times[-1])
         begin, at = ends[:-1], ends[1:]

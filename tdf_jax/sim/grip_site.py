@@ -19,7 +19,7 @@ def site_hint(model: Any) -> str:
         model: the `mujoco.MjModel`.
 
     Returns:
-        The line of MJCF and the name of the body that it belongs into; empty if there is no hand with fingers.
+        The line of MJCF and the name of the body that it belongs to; empty if there is no hand with fingers.
     """
     mujoco = extra("load_robot()", "mujoco")
     parents = [int(number) for number in model.body_parentid]

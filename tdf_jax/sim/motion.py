@@ -84,7 +84,9 @@ def plan_joints(
 
     The robot goes from home to a pose behind the pick, straight to the pick, closes, follows the trajectory (straight
     lines and geodesics between its poses), opens, retreats along the approach and goes home. The first posture of the
-    arm for which everything is within the limits and free of collisions is taken.
+    arm for which everything is within the limits and free of collisions is taken. In a cell, where the arm cannot
+    follow the whole trajectory, it follows both ends, joined by a free motion with the object in the hand; where that
+    fails too, the trajectory begins with a straight lift of `LIFT`.
 
     Args:
         trajectory: poses of the gripper's frame from the pick to the release: z along the approach, y along the closing
@@ -94,8 +96,8 @@ def plan_joints(
         grip: opening that is commanded to hold, metres: less than the width of what is held.
         cell: the cell of this robot to stay clear of; nothing by default. Its object is where it starts, and is held
             from the pick on.
-        approach: length of the straight motions before the pick and after the release, metres; half of it if there is
-            no such motion.
+        approach: length of the straight motions before the pick and after the release, metres; half or a quarter of
+            it if there is no such motion.
         seed: seed of the planner of the free motions, at least 1.
 
     Returns:

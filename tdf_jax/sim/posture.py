@@ -1,5 +1,6 @@
 """Postures of an arm: the distinct positions of its joints with which the gripper is at a pose."""
 
+import functools
 import itertools
 from collections.abc import Iterator
 
@@ -24,8 +25,9 @@ class Postures:
     def at(self, T: Float[np.ndarray, "4 4"]) -> Iterator[Float[np.ndarray, " joints"]]:
         """Postures at a pose: what is found from home, then from anywhere.
 
-        Where the pose half a turn about the approach away is known, from its postures first, the last joint turned:
-        there are no others if each can turn so far.
+        If the postures at the pose half a turn about the approach away are known, they are tried first with the last
+        joint turned by half a turn. Where that joint turns the gripper about its approach and every one of them can
+        turn so far, there are no others.
 
         Args:
             T: pose of the gripper's frame, 4x4, metres, world frame.
@@ -53,6 +55,13 @@ class Postures:
                     seen.append(wrapped)
                     yield wrapped
 
+    @functools.cached_property
+    def _turns_approach(self) -> bool:
+        """Whether the last joint turns the gripper about its approach."""
+        home = np.asarray(self.kinematics.robot.home, float)
+        turned = home + np.append(np.zeros(len(home) - 1), np.pi)
+        return np.allclose(self.kinematics.pose(turned), self.kinematics.pose(home) @ HALF_TURN, atol=1e-6)
+
     def _starts(self, T) -> Iterator[np.ndarray]:
         robot = self.kinematics.robot
         turned = list(self.at(T @ HALF_TURN)) if _key(T @ HALF_TURN) in self._found else []
@@ -63,7 +72,7 @@ class Postures:
             all_turn &= len(within) > 0
             if len(within):
                 yield np.append(one[:-1], within[np.argmin(np.abs(within - robot.home[-1]))])
-        if all_turn:
+        if all_turn and self._turns_approach:
             return
         rng = np.random.default_rng(0)
         for number in range(1 + SEARCHES):

@@ -284,7 +284,7 @@ def _spec(files: Sequence[Path], mount: str) -> Any:
     if mount:
         spec.attach(specs[1], prefix=GRIPPER_PREFIX, site=spec.site(mount))
     for body in spec.bodies:
-        body.gravcomp = 1.0  # as the controller of a real arm does; of what it holds it knows nothing
+        body.gravcomp = 1.0  # as the controller of a real arm does; a payload is compensated in tdf_jax.sim.execution
     return spec
 
 
