@@ -356,3 +356,26 @@ def drawn(robot):
     from tdf_jax.sim.tasks import draw_episode
 
     return functools.cache(lambda task, poses="upright", number=0: draw_episode(task, robot, 900, number, poses))
+
+
+@pytest.fixture(scope="session")
+def placed_scene(demonstration, small_model):
+    """A demonstration with a target, and a real imitation of it on moved objects."""
+    poses = jnp.asarray(demonstration.trajectory.wxyz_xyz)
+    motion = np.asarray(tdf.geometry.se3.compose(poses[-1], tdf.geometry.se3.inverse(poses[0])), np.float64)
+    contact = np.array([1.0, 0, 0, 0, *carried(motion, np.asarray(demonstration.points, float)).mean(axis=0)])
+    cloud = random_cloud(8) * [1.2, 0.8, 1.0]
+    target = tdf.Target(
+        cloud - cloud.mean(axis=0) + contact[4:] + [0.05, 0.05, 0.0],
+        tdf.box_query(jax.random.key(7), count=QUERIES, size=0.08),
+        contact,
+    )
+    related = dataclasses.replace(demonstration, target=target)
+    on_object, on_target = (pose * [1, 1, 1, 1, 3, 3, 3] for pose in random_poses(21, 2))
+    points = carried(on_object, np.asarray(demonstration.points, float)).astype(np.float32)
+    placed = carried(on_target, np.asarray(target.points, float)).astype(np.float32)
+    config = tdf.CarryConfig(num_starts=64, num_coarse_queries=8, coarse_steps=6, polish_steps=12)
+    result = tdf.imitate(
+        small_model, related, points, target_points=placed, key=jax.random.key(3), config=config, clean=False
+    )
+    return tdf.ImitationScene(related, points, result, placed)

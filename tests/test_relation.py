@@ -76,6 +76,22 @@ def test_the_object_goes_where_it_was_on_the_target(related, moved, result, smal
     np.testing.assert_allclose(matrices(alone), matrices(result.object_motion), atol=1e-5)
 
 
+def test_the_pick_for_a_target_is_tracked(small_model, related, moved, result):
+    """The path of the result is denser than the demonstration, of which `track` needs the pick alone."""
+    reference = tdf.describe(small_model, related)
+    assert result.trajectories.shape[1] > reference.trajectory.num_poses
+    shift = np.array([1.0, 0, 0, 0, 0.02, -0.01, 0.03])
+    field = tdf.encode(small_model, carried(shift, moved[0]).astype(np.float32))
+    found = tdf.track(field, reference, result, goal=result.goal)
+    assert not found.lost and found.trajectories.shape[1] == reference.trajectory.num_poses
+    np.testing.assert_allclose(found.goal, result.goal, atol=1e-5)
+    poses = related.trajectory.wxyz_xyz
+    approached = dataclasses.replace(related, trajectory=tdf.Trajectory(jnp.concatenate([poses[:1], poses])), grasp=1)
+    longer = tdf.describe(small_model, approached)
+    with pytest.raises(InputError, match=r"has its grasp at pose 0 .*expected 1 and -1"):
+        tdf.track(field, longer, result, goal=result.goal)
+
+
 def test_every_candidate_ends_where_its_own_pick_and_motion_lead(result):
     """M is X_t inverse(X_o), the same for all picks of one relation."""
     picks, ends = np.asarray(result.picks), np.asarray(result.trajectories)[:, result.release]

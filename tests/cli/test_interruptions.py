@@ -408,5 +408,5 @@ def test_a_process_whose_output_is_lost_keeps_its_results(weights, tmp_path, kin
     assert process.returncode == code and "Traceback" not in messages and "Exception" not in messages
     assert messages.splitlines()[-1] == f"tdf: {message.format('output')}"
     with contextlib.suppress(FileNotFoundError):
-        assert len(list((tmp_path / "out").iterdir())) == 5
+        assert len(list((tmp_path / "out").iterdir())) == 6
     assert np.isfinite(tdf.load_trajectory(tmp_path / "out" / "trajectory.npz").wxyz_xyz).all()

@@ -82,6 +82,11 @@ def test_what_is_no_result_is_refused(folder, landscape, weights, tmp_path, caps
     assert "there is no folder" in refusal(capsys, tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     assert "it is empty" in refusal(capsys, tmp_path / "empty")
+    (tmp_path / "simulation").mkdir()
+    (tmp_path / "simulation" / "result.json").write_text("{}")
+    said = refusal(capsys, tmp_path / "simulation")
+    assert "tdf view: " in said and "expected a folder of `tdf imitate` or `tdf landscape`" in said
+    assert "load_imitation" not in said
     assert "there is no file" in refusal(capsys, folder, "--landscape", tmp_path / "empty")
     assert "is a landscape, and there is --landscape" in refusal(capsys, landscape, "--landscape", landscape)
     assert "are not those that the imitation was made with" in refusal(capsys, folder, "--weights", "bowl")

@@ -78,6 +78,8 @@ COMMANDS = {
         "3", "--demonstrations", "1", "--processes", "1", "--json", "out.json", "--out", "out",
     ],
 }  # fmt: skip
+# `tdf env` reads nothing, and `tdf view` runs until Ctrl-C: tests/cli/test_view.py tries what it refuses.
+UNTRIED = ("env", "view")
 # Those whose undamaged form is quick; of the others only what is refused is tried.
 QUICK = ("imitate", "adam", "demonstrate", "landscape", "convert", "dataset", "shapes")
 RESUMED = ("dataset", "train", "benchmark", "reproduce", "simulate")  # what they finished stays if they fail

@@ -75,6 +75,9 @@ def test_a_name_that_cannot_be_saved_is_refused_at_once(tmp_path):
     for path in (tmp_path / "it.txt", tmp_path / "nowhere" / "it.npz"):
         with pytest.raises(InputError, match="expected a new .npz file in an existing folder"):
             demonstrating.check_demonstration_path("tdf view", path)
+    (tmp_path / "it.npz").touch()
+    with pytest.raises(InputError, match="it.npz, which exists; expected a new file"):
+        demonstrating.check_demonstration_path("tdf view", tmp_path / "it.npz")
 
 
 @pytest.fixture

@@ -25,6 +25,25 @@ def problem(scene, small_model):
     return solving.problem_of(scene, small_model)
 
 
+@pytest.fixture(scope="module")
+def placed(placed_scene, small_model):
+    return solving.problem_of(placed_scene, small_model)
+
+
+def test_an_imitation_without_a_pick_is_refused(scene, small_model):
+    none = np.full_like(np.asarray(scene.result.energies), np.nan)
+    without = dataclasses.replace(scene, result=dataclasses.replace(scene.result, energies=none))
+    with pytest.raises(InputError, match="tdf view: the imitation has no pick to show"):
+        solving.problem_of(without, small_model)
+
+
+def test_an_energy_of_nought_is_no_error(scene, small_model):
+    energies = np.zeros_like(np.asarray(scene.result.energies))
+    perfect = dataclasses.replace(scene, result=dataclasses.replace(scene.result, energies=energies))
+    found = solving.chosen(solving.problem_of(perfect, small_model), 0)
+    assert found.energy == 0 and found.result.first_residual == 0
+
+
 def test_a_chosen_pick_is_that_of_the_result(problem, scene):
     modes = tdf.cluster_poses(scene.result.picks, scene.result.energies)
     for number, mode in enumerate(modes):
@@ -96,17 +115,41 @@ def test_the_pick_follows_a_dragged_object():
         assert found.confidence == pytest.approx(float(result.confidence), abs=0.05) and min(found.seconds) > 0
 
 
-def test_an_object_on_a_target_keeps_its_place_there(problem, monkeypatch):
+@pytest.mark.parametrize("number", [0, 1])
+def test_the_path_to_a_target_is_that_of_the_result(placed, number):
+    """By another way: `imitate` warps the path of the reference, and the viewer that of the demonstration."""
+    found = solving.chosen(placed, number)
+    assert len(found.path) > placed.scene.demonstration.trajectory.num_poses  # made denser
+    path = solving.path_between(placed, found.pick, found.goal, found.to_target)
+    np.testing.assert_allclose(path, found.path, atol=1e-4)
+
+
+def test_the_arrival_at_a_target_moves_with_the_goal(placed):
+    last = solving.chosen(placed, 0)
+    shift = np.float32([0, 0, 0, 0, 0.1, -0.2, 0.05])
+    moved = solving.regoaled(placed, last.goal + shift, last)
+    assert moved.path.shape == last.path.shape
+    np.testing.assert_allclose(moved.path[-3:], last.path[-3:] + shift, atol=1e-4)
+    np.testing.assert_allclose(moved.path[0], last.path[0], atol=1e-4)
+    back = solving.regoaled(placed, last.goal, moved)
+    np.testing.assert_allclose(back.path, last.path, atol=1e-4)
+
+
+def test_energies_of_picks_for_a_target_are_without_the_contact_regions(placed):
+    last = solving.chosen(placed, 0)
+    assert last.energy < placed.modes[0].energy
+    assert last.energy == solving.energy_at(placed, last, last.pick)
+    still = solving.dragged(placed, solving.IDENTITY, last)
+    np.testing.assert_allclose(still.energy, last.energy, rtol=0.1)
+
+
+def test_an_object_on_a_target_keeps_its_place_there(placed):
     """The object's motion from its initial pose to its place is the same place of the dragged object."""
-    last = solving.chosen(problem, 0)
-    related = dataclasses.replace(problem.scene)
-    target = tdf.Target(random_cloud(5), random_cloud(5)[:8])
-    demonstration = dataclasses.replace(problem.scene.demonstration)
-    object.__setattr__(demonstration, "target", target)
-    object.__setattr__(related, "demonstration", demonstration)
-    placed = dataclasses.replace(problem, scene=related)
+    last = solving.chosen(placed, 0)
     motion = np.float32([1, 0, 0, 0, 0.02, -0.01, 0.03])
     found = solving.dragged(placed, motion, last)
+    assert found.path.shape == last.path.shape
+    np.testing.assert_allclose(found.path[-1, 4:], found.goal[4:], atol=1e-5)
     point = random_cloud(9)[:1]  # of the object in its initial pose
 
     def ends(found, at):

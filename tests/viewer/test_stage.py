@@ -35,6 +35,25 @@ def shown(problem):
         one.close()
 
 
+def test_what_is_placed_on_a_target_is_dragged_as_well(placed_scene, small_model):
+    """A path to a target has more poses than the demonstration: at the start, and after either drag."""
+    problem = solving.problem_of(placed_scene, small_model)
+    with serving("test", 0) as server:
+        shown = stage.Stage(server, problem)
+        try:
+            assert shown.worker.wait(SECONDS)
+            assert shown._status.content.startswith("Ready")
+            count = placed_scene.result.trajectories.shape[1]
+            drag(shown, shown._grip, shown._centroid + [0, 0, 0.05])
+            assert "Solved in" in shown._status.content
+            drag(shown, shown._goal, shown.found.goal[4:] + [0.1, 0, 0])
+            assert "The path follows" in shown._status.content
+            assert count == len(shown.found.path) == len(shown._boxes) == shown._time.max + 1
+            np.testing.assert_allclose(shown._boxes[-1].position, shown.found.path[-1, 4:], atol=1e-6)
+        finally:
+            shown.close()
+
+
 def bowl(grid):
     values = 0.002 + np.linalg.norm(grid.points, axis=-1)[None]
     return Landscape(grid, values, np.zeros((1, 3)), np.eye(3)[None], np.zeros(values.shape, np.int32))
