@@ -493,18 +493,15 @@ def carry_object(
     energies, rows = joint[rows, columns], distinct[rows]
     contact, points = reference.contact, np.asarray(objects.points, float)
     target_points = contact.target_points if objects.target_points is None else objects.target_points
+    outwards = np.asarray(se3.rotation(jnp.asarray(relations.target_contacts)) @ contact.outward, float)
     deeper = [
-        max(
-            0.0, arrival_depth(_moved(points, motion), np.asarray(target_points, float), outward) - float(contact.depth)
-        )
-        for motion, outward in zip(
-            motions, np.asarray(se3.rotation(jnp.asarray(relations.target_contacts)) @ contact.outward, float)
-        )
+        deeper_arrival(points, target_points, motion, outward, float(contact.depth))
+        for motion, outward in zip(motions, outwards)
     ]
     # Always as many candidates, so that one compiled program carries those of every object.
     pairs = np.arange(MAX_SOLUTIONS) % len(rows)
     trajectories = _carried(
-        _dense(reference.trajectory),
+        dense(reference.trajectory),
         _released_contact(reference),
         jnp.asarray(picks[rows][pairs]),
         jnp.asarray(motions[columns][pairs]),
@@ -525,8 +522,31 @@ def carry_object(
     return with_ends(result, reference)
 
 
-def _dense(trajectory: Trajectory) -> Trajectory:
-    """The demonstrated path with poses at most `SPACING` apart."""
+def deeper_arrival(
+    points: Float[np.ndarray, "points 3"],
+    target_points: Float[Array | np.ndarray, "target_points 3"],
+    motion: Float[Array | np.ndarray, "7"],
+    outward: Float[np.ndarray, "3"],
+    depth: float,
+) -> float:
+    """How much farther than demonstrated an object comes from, into a target that is deeper, metres, at least 0.
+
+    Args:
+        points: cloud of the object in its initial pose, (points, 3), metres, world frame.
+        target_points: cloud of the target, (target_points, 3), metres, world frame.
+        motion: motion of the object to its target, `wxyz_xyz`, (7,).
+        outward: unit vector from the object's place at the target to where it comes from, world frame, (3,).
+        depth: that of the demonstrated arrival, see `Arrival`, metres.
+    """
+    return max(0.0, arrival_depth(_moved(points, motion), np.asarray(target_points, float), outward) - depth)
+
+
+def dense(trajectory: Trajectory) -> Trajectory:
+    """The demonstrated path to a target with poses at most `SPACING` apart, and at least as many as it has.
+
+    Args:
+        trajectory: path from the grasp to the release.
+    """
     length = float(np.linalg.norm(np.diff(np.asarray(trajectory.translations), axis=0), axis=1).sum())
     count = min(MAX_POSES, 1 + int(np.ceil(length / SPACING)))
     return trajectory if count <= trajectory.num_poses else resample(trajectory, count)

@@ -98,6 +98,9 @@ def track(
     Where the energy is too high the pick is lost: `Result.lost` and `.status` say so, and `.best`, `.trajectory` and
     what else takes the best candidate raise. Call `carry` then. docs/results/performance.md#tracking compares both.
 
+    The path is the demonstrated one between pick and goal, as that of `carry`: after a result of `imitate` with a
+    target it does not repeat the demonstrated arrival there, and has as many poses as the demonstration.
+
     Any array may be traced by `jax.jit` and `jax.vmap`, as in `carry`. Inside of a trace nothing can be raised: look at
     `.lost`.
 
@@ -123,11 +126,20 @@ def track(
     if not isinstance(result, Result):
         raise InputError(f"track(): result is a {type(result).__name__}; expected the Result of carry() or track()")
     check_channels("track()", field, reference)
-    num_poses = len(reference.approach) + reference.trajectory.num_poses + len(reference.retreat)
-    if np.ndim(result.energies) != 1 or np.shape(result.trajectories)[-2] != num_poses:
+    before, after = len(reference.approach), len(reference.retreat)
+    num_poses = before + reference.trajectory.num_poses + after
+    shape = np.shape(result.trajectories)
+    # A path to a target is denser than the demonstration; of every result the pick alone is used.
+    denser = len(result.target_trajectories) > 0
+    if np.ndim(result.energies) != 1 or (shape[-2] != num_poses and not denser):
         raise InputError(
-            f"track(): the trajectories of the result have shape {np.shape(result.trajectories)}; expected "
-            f"(candidates, {num_poses}, 7), as of one result of this demonstration. For a batch use jax.vmap"
+            f"track(): the trajectories of the result have shape {shape}; expected (candidates, {num_poses}, 7), as of "
+            "one result of this demonstration. For a batch use jax.vmap"
+        )
+    if (result.grasp, result.release) != (before, -1 - after):
+        raise InputError(
+            f"track(): the result has its grasp at pose {result.grasp} and its release at {result.release}; expected "
+            f"{before} and {-1 - after}, as of a result of this demonstration"
         )
     if np.shape(result.latent) != field.latent.shape:
         raise InputError(
@@ -144,11 +156,11 @@ def track(
             "track(): the demonstration has a target, which gives the goal; expected a goal. Pass goal=result.goal if "
             "the target has not moved, and call imitate() if it has"
         )
-    before, lost = result.first_residual, result.lost
-    if not checks.traced(before, lost):
+    first, lost = result.first_residual, result.lost
+    if not checks.traced(first, lost):
         if np.asarray(lost).any():
             raise InputError("track(): the last result is lost; expected one that is not. Find the pick by carry()")
-        if not np.isfinite(np.asarray(before)):
+        if not np.isfinite(np.asarray(first)):
             raise InputError(
                 "track(): the last result has no residual; expected a result of carry(), imitate() or track() on at "
                 "least two query points. Find the pick by carry()"
@@ -183,8 +195,8 @@ def track(
         residual=residual,
         origin=field.origin,
         latent=field.latent,
-        first_residual=before,
-        lost=~(residual <= config.largest_energy * before) | lost,
+        first_residual=first,
+        lost=~(residual <= config.largest_energy * first) | lost,
     )
     return with_ends(result, reference)
 

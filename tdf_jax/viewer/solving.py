@@ -9,19 +9,21 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
+from tdf_jax._internal import devices
 from tdf_jax._internal.errors import InputError
 from tdf_jax.energy.descriptors import pose_descriptor
 from tdf_jax.energy.reference import Reference, describe
 from tdf_jax.energy.residual import pick_residual
 from tdf_jax.geometry import se3
-from tdf_jax.geometry.transport import carry_to_picks
+from tdf_jax.geometry.transport import Arrival, arrival_of, carry_to_picks, carry_to_target
 from tdf_jax.networks.checkpoint import load_model
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.field import DescriptorField
 from tdf_jax.networks.model import Model, fingerprint
 from tdf_jax.networks.surface import surface_triangles
+from tdf_jax.relation import deeper_arrival, dense
 from tdf_jax.solvers.imitation_scene import ImitationScene
 from tdf_jax.solvers.pick import carry
 from tdf_jax.solvers.result import Result
@@ -43,7 +45,6 @@ class Problem:
         reference: its demonstration, described.
         points: cloud of the new object in its initial pose, (points, 3), metres, world frame.
         field: field of that cloud.
-        goals: goal of every candidate, T_world_query, (candidates, 7).
     """
 
     scene: ImitationScene
@@ -51,12 +52,50 @@ class Problem:
     reference: Reference
     points: Float[np.ndarray, "points 3"]
     field: DescriptorField
-    goals: Float[np.ndarray, "candidates 7"]
 
     @functools.cached_property
     def modes(self) -> list[Mode]:
-        """Distinct picks by rising energy."""
+        """Distinct picks by rising energy of the result: with a target, the sum with those of the contact regions."""
         return cluster_poses(jnp.asarray(self.scene.result.picks), jnp.asarray(self.scene.result.energies))
+
+    @property
+    def placed(self) -> bool:
+        """Whether the object is placed on a target that was found by its contact region."""
+        return len(self.scene.result.target_trajectories) > 0
+
+    @functools.cached_property
+    def pick_energies(self) -> list[float]:
+        """Energy of the descriptors of every distinct pick alone, in the order of `modes`."""
+        if self.placed:
+            return [self.energy_in_place(mode.pose) for mode in self.modes]
+        return [float(mode.energy) for mode in self.modes]
+
+    @functools.cached_property
+    def arrival(self) -> Arrival:
+        """How the demonstrated object arrives at its target."""
+        return arrival_of(self.scene.demonstration)
+
+    def energy_in_place(self, pose: Float[np.ndarray | Array, "7"]) -> float:
+        """Energy of the descriptors at a pose (eq. 2 of one waypoint), on the object in its initial pose.
+
+        Args:
+            pose: T_world_query, `wxyz_xyz`, (7,).
+        """
+        pose = jnp.asarray(pose, jnp.float32)
+        return float(_energy(self.field, pose, self.reference.query, self.reference.descriptors[0]))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ToTarget:
+    """What a path to a target repeats of the demonstrated arrival.
+
+    Attributes:
+        target_motion: motion of the demonstrated target to where the object goes, `wxyz_xyz`, (7,), world frame.
+        deeper: how much farther than demonstrated the object comes from, metres.
+    """
+
+    target_motion: Float[np.ndarray, "7"]
+    deeper: float
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -73,6 +112,7 @@ class Found:
         confidence: probability that the pick is right, see `tdf_jax.confidence`; NaN where it is not calibrated.
         seconds: time of the encoding and of the search, seconds; None if nothing was searched.
         tracked: whether `track` found the pick; otherwise `carry` did, from many starts.
+        to_target: how the object arrives at its target; None without one.
     """
 
     pick: Float[np.ndarray, "7"]
@@ -84,6 +124,7 @@ class Found:
     confidence: float = np.nan
     seconds: tuple[float, float] | None = None
     tracked: bool = True
+    to_target: ToTarget | None = None
 
 
 def model_of(scene: ImitationScene, weights: str | None) -> Model:
@@ -121,19 +162,19 @@ def problem_of(scene: ImitationScene, model: Model) -> Problem:
     Args:
         scene: the imitation.
         model: its network.
+
+    Raises:
+        InputError: the imitation has no pick.
     """
+    if not np.asarray(scene.result.finite).any():
+        raise InputError(
+            f"tdf view: the imitation has no pick to show: {scene.result.status}; expected a finite candidate: check "
+            "the clouds, and run `tdf imitate` again"
+        )
     alone = dataclasses.replace(scene.demonstration, target=None)
     clean = int(scene.result.foreign_points) > 0
     field, kept = encode(model, scene.points, clean=clean, return_kept=True)
-    trajectories = np.asarray(scene.result.trajectories)
-    return Problem(
-        scene,
-        model,
-        describe(model, alone),
-        np.asarray(scene.points)[np.asarray(kept)],
-        field,
-        trajectories[:, scene.result.release],
-    )
+    return Problem(scene, model, describe(model, alone), np.asarray(scene.points)[np.asarray(kept)], field)
 
 
 def chosen(problem: Problem, number: int) -> Found:
@@ -146,18 +187,24 @@ def chosen(problem: Problem, number: int) -> Found:
     index = int(problem.modes[number].members[0])
     result = problem.scene.result
     path = np.asarray(result.trajectories)[index]
-    energy = float(problem.modes[number].energy)
+    energy = problem.pick_energies[number]
     confident = float(result.confidence) if number == 0 else np.nan
     one = [index]
+    first = np.asarray(result.first_residual)
+    if np.isfinite(first):
+        # By which `track` knows whether it is lost: a worse pick has a higher one.
+        first = np.float32(pick_residual(energy, problem.reference.descriptors[0]))
     alone = dataclasses.replace(
         result,
         trajectories=np.asarray(result.trajectories)[one],
         energies=np.asarray(result.energies)[one],
         candidate_history=np.asarray(result.candidate_history)[one],
-        # By which `track` knows whether it is lost: a worse pick has a higher one.
-        first_residual=np.asarray(result.first_residual) * np.float32(energy / problem.modes[0].energy),
+        first_residual=first,
+        lost=np.zeros((), bool),
     )
-    return Found(path[result.grasp], path[result.release], path, energy, IDENTITY.copy(), alone, confident)
+    to_target = _to_target(problem, index) if problem.placed else None
+    ends = path[result.grasp], path[result.release]
+    return Found(*ends, path, energy, IDENTITY.copy(), alone, confident, to_target=to_target)
 
 
 def dragged(problem: Problem, motion: Float[np.ndarray, "7"], last: Found) -> Found:
@@ -179,29 +226,35 @@ def dragged(problem: Problem, motion: Float[np.ndarray, "7"], last: Found) -> Fo
     pick = np.asarray(result.pick)
     energy = float(result.loss)
     goal = last.goal
-    if problem.scene.demonstration.target is not None:
+    if last.to_target is not None:
         step = se3.compose(jnp.asarray(motion), se3.inverse(jnp.asarray(last.motion)))
         released = se3.compose(jnp.asarray(last.goal), se3.inverse(jnp.asarray(last.pick)))  # the object's motion
         goal = np.asarray(se3.compose(se3.compose(released, se3.inverse(step)), jnp.asarray(pick)))
     seconds = (encoded - began, time.perf_counter() - encoded)
-    path = path_between(problem, pick, goal)
+    path = path_between(problem, pick, goal, last.to_target)
     confident = _confidence(problem, energy)
-    return Found(pick, goal, path, energy, np.asarray(motion), result, confident, seconds, tracked)
+    return Found(pick, goal, path, energy, np.asarray(motion), result, confident, seconds, tracked, last.to_target)
 
 
 def regoaled(problem: Problem, goal: Float[np.ndarray, "7"], last: Found) -> Found:
-    """The same pick, with the demonstration warped to another goal.
+    """The same pick, with the demonstration warped to another goal; the arrival at a target moves with the goal.
 
     Args:
         problem: the problem.
         goal: the goal, T_world_query, `wxyz_xyz`.
         last: the last result.
     """
-    return dataclasses.replace(last, goal=np.asarray(goal), path=path_between(problem, last.pick, goal), seconds=None)
+    to_target = last.to_target
+    if to_target is not None:
+        shift = se3.compose(jnp.asarray(goal, jnp.float32), se3.inverse(jnp.asarray(last.goal, jnp.float32)))
+        moved = np.asarray(se3.compose(shift, jnp.asarray(to_target.target_motion)))
+        to_target = dataclasses.replace(to_target, target_motion=moved)
+    path = path_between(problem, last.pick, goal, to_target)
+    return dataclasses.replace(last, goal=np.asarray(goal), path=path, seconds=None, to_target=to_target)
 
 
 def path_between(
-    problem: Problem, pick: Float[np.ndarray, "7"], goal: Float[np.ndarray, "7"]
+    problem: Problem, pick: Float[np.ndarray, "7"], goal: Float[np.ndarray, "7"], to_target: ToTarget | None = None
 ) -> Float[np.ndarray, "poses 7"]:
     """The demonstration warped to a pick and a goal, with its approach and its retreat, (poses, 7).
 
@@ -209,11 +262,21 @@ def path_between(
         problem: the problem.
         pick: T_world_query at the grasp, `wxyz_xyz`, (7,).
         goal: T_world_query at the release.
+        to_target: how the object arrives at its target; None without one.
     """
     reference = problem.reference
-    transfer = carry_to_picks(
-        reference.trajectory, jnp.asarray(pick, jnp.float32)[None], jnp.asarray(goal, jnp.float32)
-    )[0]
+    pick, goal = jnp.asarray(pick, jnp.float32), jnp.asarray(goal, jnp.float32)
+    if to_target is None:
+        transfer = carry_to_picks(reference.trajectory, pick[None], goal)[0]
+    else:
+        transfer = _carried(
+            dense(problem.scene.demonstration.transfer),
+            pick,
+            goal,
+            jnp.asarray(to_target.target_motion, jnp.float32),
+            jnp.float32(problem.arrival.length),
+            jnp.float32(to_target.deeper),
+        )
     demonstrated = reference.trajectory.wxyz_xyz
     parts = [
         se3.compose(se3.compose(transfer[0], se3.inverse(demonstrated[0])), reference.approach),
@@ -233,7 +296,27 @@ def energy_at(problem: Problem, found: Found, pose: Float[np.ndarray, "7"]) -> f
     """
     # In the initial pose of the object, whose field is known: the network turns with its cloud.
     pose = se3.compose(se3.inverse(jnp.asarray(found.motion, jnp.float32)), jnp.asarray(pose, jnp.float32))
-    return float(_energy(problem.field, pose, problem.reference.query, problem.reference.descriptors[0]))
+    return problem.energy_in_place(pose)
+
+
+def _to_target(problem: Problem, index: int) -> ToTarget:
+    """How the object of a candidate arrives at its target."""
+    scene, result, arrival = problem.scene, problem.scene.result, problem.arrival
+    shown = scene.demonstration.target
+    assert shown is not None  # there would be no contact poses
+    path = jnp.asarray(np.asarray(result.trajectories)[index])
+    motion = se3.compose(path[result.release], se3.inverse(path[result.grasp]))
+    contact = jnp.asarray(np.asarray(result.target_trajectories)[index, 0], jnp.float32)
+    target_motion = se3.compose(contact, se3.inverse(jnp.asarray(shown.T_world_contact, jnp.float32)))
+    outward = np.asarray(se3.rotation(target_motion), float) @ arrival.outward
+    target_points = np.asarray(shown.points if scene.target_points is None else scene.target_points)
+    deeper = deeper_arrival(np.asarray(problem.points, float), target_points, motion, outward, arrival.depth)
+    return ToTarget(np.asarray(target_motion), deeper)
+
+
+@devices.quickly_compiled
+def _carried(path, pick, goal, target_motion, arrival, deeper):
+    return carry_to_target(path, pick, goal, target_motion, arrival=arrival, deeper=deeper).wxyz_xyz
 
 
 @jax.jit

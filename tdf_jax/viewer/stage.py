@@ -72,17 +72,8 @@ class Stage:
         }
         self._path = handles.add_path(server, "/imitation/path", self.found.path[:, 4:], INK)
         self._box = handles.add_box(server, "/imitation/box", demonstration.query, BOX, 1.6 * handles.LINE)
-        self._boxes = [
-            handles.add_box(
-                server,
-                f"/imitation/boxes/{index}",
-                demonstration.query,
-                COLOURS(index / max(1, len(self.found.path) - 1)),
-                0.5 * handles.LINE,
-            )
-            for index in range(len(self.found.path))
-        ]
-        self._nodes["boxes along the path"] = list(self._boxes)
+        self._boxes: list[Any] = []
+        self._fit(len(self.found.path))
         self._draw_picks()
         if scene.expected is not None:
             truth = np.asarray(scene.expected.wxyz_xyz)
@@ -108,6 +99,24 @@ class Stage:
         self._grip.on_update(lambda event: self._drag_object(event.target))
         self._goal.on_update(lambda event: self._drag_goal(event.target))
         self._look()
+
+    def _fit(self, poses: int) -> None:
+        """Have as many boxes along the path as it has poses."""
+        if len(self._boxes) == poses:
+            return
+        visible = all(node.visible for node in self._boxes)
+        for node in self._boxes:
+            node.remove()
+        query = self.problem.scene.demonstration.query
+        self._boxes = [
+            handles.add_box(
+                self.server, f"/imitation/boxes/{i}", query, COLOURS(i / max(1, poses - 1)), 0.5 * handles.LINE
+            )
+            for i in range(poses)
+        ]
+        for node in self._boxes:
+            node.visible = visible
+        self._nodes["boxes along the path"] = list(self._boxes)
 
     def _draw_picks(self) -> None:
         modes = self.problem.modes[:SHOWN_MODES]
@@ -194,7 +203,8 @@ class Stage:
         self._play.on_click(lambda _: self._stop() if self._playing else self._start())
         with gui.add_folder("Picks"):
             modes = self.problem.modes[:SHOWN_MODES]
-            names = [f"{number}: energy {mode.energy:.4f}" for number, mode in enumerate(modes, 1)]
+            energies = self.problem.pick_energies[: len(modes)]
+            names = [f"{number}: energy {energy:.4f}" for number, energy in enumerate(energies, 1)]
             self._choice = gui.add_dropdown("shown", names, initial_value=names[0])
             gui.add_markdown(_table(self.problem))
         self._choice.on_update(lambda event: self._choose(names.index(event.target.value)))
@@ -305,7 +315,9 @@ class Stage:
         with self._lock, self.server.atomic():
             self.found = found
             self._path.points = handles.path_segments(found.path[:, 4:]).astype(np.float32)
-            for node, pose in zip(self._boxes, found.path):
+            self._fit(len(found.path))
+            self._time.max = max(float(len(found.path) - 1), STEP)
+            for node, pose in zip(self._boxes, found.path, strict=True):
                 handles.place(node, pose[:4], pose[4:])
             if goal:
                 handles.place(self._goal, found.goal[:4], found.goal[4:])
@@ -446,12 +458,15 @@ def _words(found: Found) -> str:
 
 
 def _table(problem: Problem) -> str:
-    """The distinct picks by rising energy."""
+    """The distinct picks by rising energy, of the pick alone and, with a target, with those of the contact regions."""
     modes = problem.modes
-    rows = ["| pick | energy | above the best |", "|---|---|---|"]
-    for number, mode in enumerate(modes[:SHOWN_MODES], 1):
-        rows.append(
-            f"| {number} | {mode.energy:.5f} | {'' if number == 1 else above(mode, modes[0]).split(' above')[0]} |"
-        )
-    words = f"{len(modes)} distinct of {len(problem.scene.result.energies)} candidates; dark boxes have low energies."
+    names = ["pick", "energy", *["with the target's"] * problem.placed, "above the best"]
+    rows = [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
+    for number, (mode, energy) in enumerate(zip(modes[:SHOWN_MODES], problem.pick_energies), 1):
+        both = [f"{mode.energy:.5f}"] * problem.placed
+        behind = "" if number == 1 else above(mode, modes[0]).split(" above")[0]
+        rows.append(f"| {' | '.join([str(number), f'{energy:.5f}', *both, behind])} |")
+    listed = f" (the first {SHOWN_MODES} are listed)" if len(modes) > SHOWN_MODES else ""
+    candidates = len(problem.scene.result.energies)
+    words = f"{len(modes)} distinct of {candidates} candidates{listed}; dark boxes have low energies."
     return "\n".join([*rows, "", words])
