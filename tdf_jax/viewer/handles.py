@@ -119,7 +119,11 @@ def add_path(server: Any, name: str, xyz: Float[np.ndarray, "poses 3"], colour: 
 
 
 def add_map(
-    server: Any, name: str, points: Float[np.ndarray, "rows columns 3"], energies: Float[np.ndarray, "rows columns"]
+    server: Any,
+    name: str,
+    points: Float[np.ndarray, "rows columns 3"],
+    energies: Float[np.ndarray, "rows columns"],
+    limits: tuple[float, float],
 ) -> Any:
     """Add a plane of a landscape, coloured by its energies; points without an energy are left out.
 
@@ -128,6 +132,7 @@ def add_map(
         name: name of the node.
         points: points of the plane, (rows, columns, 3).
         energies: their energies, (rows, columns).
+        limits: lowest and highest energy of the colours.
     """
     import trimesh
 
@@ -141,8 +146,8 @@ def add_map(
     )
     flat = energies.ravel()
     faces = faces[np.isfinite(flat[faces]).all(axis=1)]
-    low, high = np.nanmin(energies), np.nanmax(energies)
-    share = np.nan_to_num((flat - low) / max(float(high - low), 1e-12))
+    low, high = limits
+    share = np.nan_to_num((flat - low) / max(high - low, 1e-12))
     colours = (255 * COLOURS(share)).astype(np.uint8)
     both = np.concatenate([faces, faces[:, ::-1]])  # the plane is seen from both sides
     mesh = trimesh.Trimesh(points.reshape(-1, 3), both, vertex_colors=colours, process=False)

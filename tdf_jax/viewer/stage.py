@@ -87,7 +87,8 @@ class Stage:
         if target is not None:
             self._nodes["target"] = [handles.add_cloud(server, "/imitation/target", np.asarray(target), CLOUD)]
         self._draw_demonstration()
-        self._probe = handles.add_box(server, "/imitation/probe", demonstration.query, PROBE)
+        # It is a place on the object, and moves with it.
+        self._probe = handles.add_box(server, "/imitation/object/probe", demonstration.query, PROBE)
         self._probe.visible = False
         self._grip = server.scene.add_transform_controls(
             "/imitation/drag_object", scale=GRIP * self._size(), line_width=3.0, depth_test=False
@@ -199,7 +200,7 @@ class Stage:
             last = len(self.found.path) - 1
             self._time = gui.add_slider("pose", 0.0, max(float(last), STEP), STEP, float(result.grasp))
             self._play = gui.add_button("Play")
-        self._time.on_update(lambda _: self._show_time())
+        self._time.on_update(self._time_moved)
         self._play.on_click(lambda _: self._stop() if self._playing else self._start())
         with gui.add_folder("Picks"):
             modes = self.problem.modes[:SHOWN_MODES]
@@ -255,6 +256,8 @@ class Stage:
         motion = np.concatenate([grip.wxyz, np.asarray(grip.position) - R @ self._centroid])
         with self._lock:
             self._stop()
+            # Later the object is held, and not at its handle.
+            self._time.value = float(self.problem.scene.result.grasp)
             handles.place(self._object, motion[:4], motion[4:])
         self.worker.ask("solve", lambda: self._solve(motion))
 
@@ -286,21 +289,27 @@ class Stage:
     def _clicked(self, event: Any) -> None:
         if not self._click.value:
             return
-        motion = jnp.asarray(self.found.motion, jnp.float32)
-        points = np.asarray(se3.transform(motion, jnp.asarray(self.problem.points, jnp.float32)))
-        point = solving.point_under(points, np.array(event.ray_origin), np.array(event.ray_direction), REACH)
+        # In the object's initial pose: the object may be dragged away, and held.
+        R = Rotation.from_quat(np.asarray(self._object.wxyz), scalar_first=True).inv()
+        origin = R.apply(np.asarray(event.ray_origin) - np.asarray(self._object.position))
+        point = solving.point_under(self.problem.points, origin, R.apply(event.ray_direction), REACH)
         if point is None:
             self._energy.content = "No point of the object's cloud is there."
             return
         self.worker.ask("probe", lambda: self._show_energy(point))
 
     def _show_energy(self, point: Float[np.ndarray, "3"]) -> None:
-        """Place the box of query points with its middle at a point, in the orientation of the pick."""
-        pick = self.found.pick
+        """Place the box of query points with its middle at a point, in the orientation of the pick.
+
+        Args:
+            point: a point of the object in its initial pose, (3,), metres.
+        """
+        found = self.found
+        pick = np.asarray(se3.compose(se3.inverse(jnp.asarray(found.motion, jnp.float32)), jnp.asarray(found.pick)))
         R = Rotation.from_quat(pick[:4], scalar_first=True).as_matrix()
         middle = np.asarray(self.problem.reference.query, float).mean(axis=0)
         pose = np.concatenate([pick[:4], point - R @ middle])
-        energy = solving.energy_at(self.problem, self.found, pose)
+        energy = self.problem.energy_in_place(pose)
         handles.place(self._probe, pose[:4], pose[4:])
         self._probe.visible = True
         away = np.linalg.norm(pose[4:] - pick[4:])
@@ -342,6 +351,11 @@ class Stage:
     def _put(self, node: Any, R: np.ndarray, t: np.ndarray) -> None:
         handles.place(node, Rotation.from_matrix(R).as_quat(scalar_first=True), t)
 
+    def _time_moved(self, event: Any) -> None:
+        if event.client_id is not None:  # the user's hand, not the player
+            self._stop()
+        self._show_time()
+
     def _start(self) -> None:
         self._playing = stop = threading.Event()
         self._play.label = "Pause"
@@ -353,17 +367,21 @@ class Stage:
             began, first = time.monotonic(), self._time.value
             while not stop.wait(1 / RATE):
                 place = first + POSES_A_SECOND * (time.monotonic() - began)
-                self._time.value = min(float(last), round(place / STEP) * STEP)
-                if place >= last:
-                    self._stop()
+                with self._lock:
+                    if stop.is_set():
+                        break
+                    self._time.value = min(float(last), round(place / STEP) * STEP)
+                    if place >= last:
+                        self._stop()
 
         threading.Thread(target=run, daemon=True).start()
 
     def _stop(self) -> None:
-        playing, self._playing = self._playing, None
-        if playing is not None:
-            playing.set()
-            self._play.label = "Play"
+        with self._lock:
+            playing, self._playing = self._playing, None
+            if playing is not None:
+                playing.set()
+                self._play.label = "Play"
 
 
 def look(server: Any, contents: Float[np.ndarray, "points 3"]) -> None:
@@ -421,12 +439,15 @@ def show_landscape(server: Any, landscape: Landscape) -> None:
     nodes: dict[str, Any] = {}
 
     def slice_at(number: int) -> None:
-        nodes["slice"] = handles.add_map(server, "/landscape/slice", points[..., number, :], energy[..., number])
+        visible = nodes["slice"].visible if nodes else True
+        plane = handles.add_map(server, "/landscape/slice", points[..., number, :], energy[..., number], (low, high))
+        plane.visible = visible
+        nodes["slice"] = plane
 
     with gui.add_folder("Landscape"):
         gui.add_markdown(f"Energy from {low:.4f} (dark) to {high:.4f} (light); red: minimum of each waypoint.")
         if energy.ndim == 2:
-            nodes["slice"] = handles.add_map(server, "/landscape/slice", points, energy)
+            nodes["slice"] = handles.add_map(server, "/landscape/slice", points, energy, (low, high))
         else:
             count = energy.shape[2]
             chosen = gui.add_slider("slice", 0, count - 1, 1, count // 2)

@@ -106,6 +106,38 @@ def test_the_object_is_carried_between_grasp_and_release(shown):
     np.testing.assert_allclose(shown._box.position, shown.found.path[-1, 4:], atol=1e-6)
 
 
+def test_an_object_that_is_dragged_while_it_is_held_stays_at_its_handle(shown):
+    shown._time.value = float(len(shown.found.path) - 1)
+    drag(shown, shown._grip, shown._centroid + [0, 0, 0.05])
+    assert shown._time.value == shown.problem.scene.result.grasp
+    np.testing.assert_allclose(shown._object.position, [0, 0, 0.05], atol=1e-6)
+
+
+def test_the_point_that_is_clicked_is_that_of_the_held_object(shown, problem):
+    drag(shown, shown._grip, shown._centroid + [0, 0, 0.05])
+    shown._time.value = float(len(shown.found.path) - 1)
+    shown._show_time()
+    R = Rotation.from_quat(shown._object.wxyz, scalar_first=True)
+    point = R.apply(problem.points[7]) + shown._object.position
+    shown._click.value = True
+    above = R.apply([0, 0, 1e-3])
+    shown._clicked(type("Event", (), {"ray_origin": point + above, "ray_direction": -above})())
+    assert shown.worker.wait(SECONDS)
+    pose = np.concatenate([shown._probe.wxyz, shown._probe.position])  # on the object
+    assert f"**{problem.energy_in_place(pose):.4f}**" in shown._energy.content
+    turn = Rotation.from_quat(shown._probe.wxyz, scalar_first=True)
+    middle = turn.apply(np.asarray(problem.reference.query).mean(axis=0)) + shown._probe.position
+    np.testing.assert_allclose(middle, problem.points[7], atol=1e-6)
+
+
+def test_a_hand_on_the_slider_stops_the_player(shown):
+    shown._start()
+    shown._time_moved(type("Event", (), {"client_id": None})())
+    assert shown._playing
+    shown._time_moved(type("Event", (), {"client_id": 0})())
+    assert not shown._playing and shown._play.label == "Play"
+
+
 def test_playing_ends_at_the_last_pose(shown, monkeypatch):
     monkeypatch.setattr(stage, "POSES_A_SECOND", 30.0)
     shown._start()
@@ -149,6 +181,12 @@ def test_a_landscape_is_shown_in_slices(grid):
         stage.show_landscape(server, bowl(grid))
         names = set(server.scene._handle_from_node_name)
         assert {"/landscape/slice", "/landscape/waypoints", "/landscape/minimisers"} <= names
+        inputs = server.gui._gui_input_handle_from_uuid.values()
+        sliders = [one for one in inputs if type(one).__name__ == "GuiSliderHandle"]
+        server.scene._handle_from_node_name["/landscape/slice"].visible = False
+        for slider in sliders:
+            slider.value = 0
+        assert not server.scene._handle_from_node_name["/landscape/slice"].visible
         each = bowl(grid)
         object.__setattr__(each, "values", each.values[:, None])
         object.__setattr__(each, "turned", None)
