@@ -179,7 +179,8 @@ class HandStage:
             return
         self.saved += 1
         self._status.content = (
-            f"**Saved {self.path}.** Imitate it: `tdf imitate --demonstration {self.path} --target NEW_OBJECT`"
+            f"**Saved {self.path}.** Imitate it: `tdf imitate --demonstration {self.path} --target NEW_OBJECT`, with "
+            "`--category` if the object is no mug, or `--weights` of your own"
         )
 
     def _corners(self) -> np.ndarray:
@@ -188,6 +189,7 @@ class HandStage:
     def _resize(self, edges: np.ndarray) -> None:
         self._edges = edges
         self._box = handles.add_box(self.server, "/box/edges", self._corners(), COLOURS(0.35), 1.6 * handles.LINE)
+        self._show()
 
     def _follow(self) -> None:
         """Carry the object with the box between the grasp and the release."""
@@ -237,7 +239,9 @@ def check_demonstration_path(function: str, path: Path) -> None:
         path: the file.
 
     Raises:
-        InputError: the suffix is not .npz, or there is no such folder.
+        InputError: the suffix is not .npz, there is no such folder, or the file exists.
     """
     if checks.path(function, path).suffix != ".npz" or path.is_dir() or not path.parent.is_dir():
         raise InputError(f"{function}: --demonstrate is {path}; expected a new .npz file in an existing folder")
+    if path.exists():
+        raise InputError(f"{function}: --demonstrate is {path}, which exists; expected a new file: another name")

@@ -112,6 +112,10 @@ def test_the_object_moves_with_the_box_between_grasp_and_release(by_hand):
     np.testing.assert_allclose(by_hand._object.position, motion[4:], atol=1e-5)
     by_hand.save()
     assert by_hand.saved == 1 and f"Saved {by_hand.path}" in by_hand._status.content
+    assert "`--category`" in by_hand._status.content
+    by_hand._resize(np.array([0.1, 0.02, 0.02]))
+    for key in by_hand._keys:  # they are as large as the box
+        np.testing.assert_allclose(np.ptp(key.points.reshape(-1, 3), axis=0), [0.1, 0.02, 0.02], atol=1e-6)
     read = tdf.load_demonstration(by_hand.path)
     assert read.transfer.num_poses == demonstrating.NUM_POSES
     np.testing.assert_allclose(read.transfer.wxyz_xyz[0, 4:], grasp[4:], atol=1e-6)
