@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from tdf_jax._internal.cache import kept
 from tdf_jax._internal.errors import InputError, TdfWarning
