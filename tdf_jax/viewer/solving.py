@@ -265,14 +265,14 @@ def path_between(
         to_target: how the object arrives at its target; None without one.
     """
     reference = problem.reference
-    pick, goal = jnp.asarray(pick, jnp.float32), jnp.asarray(goal, jnp.float32)
+    begin, end = jnp.asarray(pick, jnp.float32), jnp.asarray(goal, jnp.float32)
     if to_target is None:
-        transfer = carry_to_picks(reference.trajectory, pick[None], goal)[0]
+        transfer = carry_to_picks(reference.trajectory, begin[None], end)[0]
     else:
         transfer = _carried(
             dense(problem.scene.demonstration.transfer),
-            pick,
-            goal,
+            begin,
+            end,
             jnp.asarray(to_target.target_motion, jnp.float32),
             jnp.float32(problem.arrival.length),
             jnp.float32(to_target.deeper),
