@@ -56,6 +56,11 @@ def imitate(settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()) 
     pictures = Pictures("tdf imitate")
 
     def one(settings):
+        if settings.animation is not None and settings.out.resolve() in settings.animation.resolve().parents:
+            raise InputError(
+                f"tdf imitate: --animation is {settings.animation}, in --out {settings.out}, which holds the files of "
+                "one run and is replaced by the next; expected a file beside it"
+            )
         with replace_folder("tdf imitate", settings.out, RESULT, NAMES) as folder:
             return _run(settings, folder, pictures)
 

@@ -39,6 +39,11 @@ def imitate_targets(
     for name in CONTRADICTING:
         if getattr(settings, name) is not None:
             raise InputError(f"tdf imitate: --{name} and --targets name new objects; drop one of them")
+    if settings.animation is not None:
+        raise InputError(
+            "tdf imitate: --animation is one film, which every object of --targets would overwrite; drop one of them, "
+            "and film a single object by --target"
+        )
     folder = settings.targets
     if folder is None or not folder.is_dir():
         raise InputError(f"tdf imitate: --targets is {folder}; expected a folder of meshes or point clouds")

@@ -67,6 +67,11 @@ def view(
     alone = not (folder / SCENE).exists() and (folder / "landscape.npz").is_file()
     if alone and landscape is not None:
         raise InputError(f"tdf view: {folder} is a landscape, and there is --landscape {landscape}; drop one")
+    if not alone and folder.is_dir() and not (folder / SCENE).is_file() and any(folder.iterdir()):
+        raise InputError(
+            f"tdf view: {folder} has neither {SCENE} nor landscape.npz; expected a folder of `tdf imitate` or "
+            "`tdf landscape`, which it shows. Of `tdf simulate` and other commands, see the pictures and films"
+        )
     file = folder / "landscape.npz" if alone else None if landscape is None else landscape / "landscape.npz"
     energies = None if file is None else load_landscape(file)[0]
     problem = None

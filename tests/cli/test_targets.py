@@ -91,6 +91,7 @@ def test_a_refused_object_does_not_stop_the_others(objects, tmp_path, weights, c
     [
         (["--target", "a.npy"], "--target and --targets name new objects"),
         (["--task", "mug_on_rack"], "--task and --targets name new objects"),
+        (["--animation", "film.gif"], "--animation is one film, which every object of --targets would overwrite"),
         (["--targets", "nowhere"], "--targets is nowhere; expected a folder"),
         (["--targets", "empty"], "has no mesh and no point cloud"),
         (["--out", "single"], "is the result of one object"),
