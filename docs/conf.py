@@ -10,13 +10,14 @@ import re
 import sys
 from pathlib import Path
 
+from sphinx.errors import ExtensionError
+
+import tdf_jax
+
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 
-import executed_notebooks  # noqa: E402
-from sphinx.errors import ExtensionError  # noqa: E402
-
-import tdf_jax  # noqa: E402
+import executed_notebooks  # noqa: E402  # it stands beside this file, which the line above makes known
 
 project = "tdf_jax"
 author = "The tdf_jax authors"

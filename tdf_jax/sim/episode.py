@@ -189,15 +189,7 @@ def run_episode(
         noted: called with the cell, the state and a word when something happens: "closed", "collided", "struck" (the
             hand and the target), "lost" (from the hand), and "end".
     """
-    cell = build_workcell(
-        robot,
-        episode.object_body,
-        episode.T_world_object,
-        episode.target_body,
-        episode.T_world_target,
-        fixture=episode.fixture,
-        fixed_target=TASKS[episode.task].fixed,
-    )
+    cell = start_cell(episode, robot)
     openings = [episode.grip.opening] * len(candidates) if openings is None else openings
     plan = plan_motion(candidates, robot, openings=openings, grip=0.0, cell=cell, seed=seed)
     if planned is not None:
@@ -308,6 +300,24 @@ def _reset(episode: Episode, T_world_object) -> Verdict:
             placed=False, cause="stuck", detail="with gravity reversed the object stays on the target"
         )
     return verdict
+
+
+def start_cell(episode: Episode, robot: Robot) -> Workcell:
+    """The cell of an episode at its start, with the robot.
+
+    Args:
+        episode: the episode.
+        robot: the robot.
+    """
+    return build_workcell(
+        robot,
+        episode.object_body,
+        episode.T_world_object,
+        episode.target_body,
+        episode.T_world_target,
+        fixture=episode.fixture,
+        fixed_target=TASKS[episode.task].fixed,
+    )
 
 
 def reset_cell(episode: Episode, T_world_object: Float[np.ndarray, "4 4"]) -> Workcell:

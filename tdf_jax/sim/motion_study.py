@@ -17,16 +17,17 @@ from pathlib import Path
 
 import numpy as np
 
+from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
 from tdf_jax.evaluation.statistics import bootstrap_interval
 from tdf_jax.evaluation.tables import between, markdown, percent
 from tdf_jax.sim.collision import Collisions
+from tdf_jax.sim.episode import start_cell
 from tdf_jax.sim.kinematics import kinematics_of
 from tdf_jax.sim.motion import Failure, plan_motion
 from tdf_jax.sim.posture import HALF_TURN
 from tdf_jax.sim.robot import Robot, load_robot
 from tdf_jax.sim.tasks import POSES, TASKS, Episode, draw_episode, true_path
-from tdf_jax.sim.workcell import build_workcell
 
 SEARCHES, ITERATIONS = 120, 40  # random starts at each end, and steps from each
 
@@ -93,15 +94,7 @@ def plan_task(robot: Robot, task: str, poses: str, seed: int, number: int) -> Ro
     """
     episode = draw_episode(task, robot, seed, number, poses, reachable=reachable)
     path = np.asarray(true_path(episode).matrices, float)
-    cell = build_workcell(
-        robot,
-        episode.object_body,
-        episode.T_world_object,
-        episode.target_body,
-        episode.T_world_target,
-        fixture=episode.fixture,
-        fixed_target=TASKS[task].fixed,
-    )
+    cell = start_cell(episode, robot)
     begun = time.process_time()
     plan = plan_motion([path], robot, openings=[episode.grip.opening], grip=0.0, cell=cell)
     seconds = time.process_time() - begun
@@ -154,7 +147,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     settings = parser.parse_args(arguments)
     if settings.episodes < 1 or settings.seed < 0:
         parser.error("--episodes must be at least 1, and --seed at least 0")
-    robot, rows = load_robot(settings.robot, settings.site), []
+    if settings.out is not None and not settings.out.parent.is_dir():  # said before the work, not after it
+        parser.error(f"--out is {settings.out}; expected a file in an existing folder")
+    try:
+        robot, rows = load_robot(settings.robot, settings.site), []
+    except InputError as error:
+        parser.error(str(error))
     for task in settings.tasks:
         for poses in settings.poses:
             for number in range(settings.episodes):

@@ -311,7 +311,8 @@ class Result:
             rows[name] = f"{value:.2f} {words}" if np.isfinite(value) else "unknown"
         if self.advice:
             rows["advice"] = self.advice
-        rows["solutions"] = f"{_distinct_picks(self)} distinct picks"
+        distinct = _distinct_picks(self)
+        rows["solutions"] = f"{distinct} distinct pick{'' if distinct == 1 else 's'}"
         return rows
 
 

@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from tdf_jax.solvers.imitation_scene import ImitationScene
 from tdf_jax.viz import polygons3d
 from tdf_jax.viz.motion import Motion, motion_of
-from tdf_jax.viz.scene3d import SHOWN_POINTS, bounds, frame, triangles_of
+from tdf_jax.viz.scene3d import bounds, frame, thinned, triangles_of
 from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, LIGHT, STYLE, add_axes3d, blank_figure
 
 WIDTH, HEIGHT, DPI = 6.4, 3.6, 100  # inches, and pixels of an inch
@@ -71,14 +71,10 @@ def film_frames(scene: ImitationScene, frames: int = FRAMES) -> Iterator[UInt8[n
         yield from [picture] * (1 if number < frames - 1 else HOLD)
 
 
-def _thinned(points: np.ndarray) -> np.ndarray:
-    return np.asarray(points, float)[:: -(-len(points) // SHOWN_POINTS)]
-
-
 def _content(motion: Motion, parts: tuple, box: np.ndarray) -> np.ndarray:
     """All that is shown in any frame, (points, 3), metres."""
     points, _, target, path = parts
-    moved = np.einsum("fij,nj->fni", motion.object_rotations, _thinned(points)) + motion.object_translations[:, None]
+    moved = np.einsum("fij,nj->fni", motion.object_rotations, thinned(points)) + motion.object_translations[:, None]
     boxes = np.einsum("fij,nj->fni", motion.rotations, box) + motion.translations[:, None]
     found = [moved.reshape(-1, 3), boxes.reshape(-1, 3), path[:, 4:]]
     return np.concatenate(found if target is None else [*found, target])
@@ -90,11 +86,11 @@ def _draw(axes, motion: Motion, number: int, parts: tuple, box: np.ndarray) -> N
     axes.computed_zorder = False
     pieces = polygons3d.Pieces([], [], [])
     if triangles is None:
-        axes.scatter(*(CENTIMETRES * (_thinned(points) @ R.T + t).T), s=2.0, color=COLOURS(0.0), linewidths=0)
+        axes.scatter(*(CENTIMETRES * (thinned(points) @ R.T + t).T), s=2.0, color=COLOURS(0.0), linewidths=0)
     else:
         pieces += polygons3d.surface(CENTIMETRES * (triangles @ R.T + t), LIGHT)
     if target is not None:
-        axes.scatter(*(CENTIMETRES * _thinned(target).T), s=2.0, color=CLOUD, linewidths=0)
+        axes.scatter(*(CENTIMETRES * thinned(target).T), s=2.0, color=CLOUD, linewidths=0)
     corners = box @ motion.rotations[number].T + motion.translations[number]
     pieces += polygons3d.box(CENTIMETRES * corners, COLOURS(0.35))
     axes.add_collection3d(pieces.collection(), autolim=False)

@@ -14,7 +14,7 @@ from tdf_jax.uncertainty.modes import Mode, cluster_poses
 from tdf_jax.viz import polygons3d
 from tdf_jax.viz.motion import Motion, motion_of
 from tdf_jax.viz.page import camera, listed, pages, scene_axes, write_page
-from tdf_jax.viz.scene3d import MOST_TRIANGLES, SHOWN_POINTS, VIEW, bounds
+from tdf_jax.viz.scene3d import MOST_TRIANGLES, VIEW, bounds, thinned
 from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, TRUTH
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ class _Panel:
 
     def content(self, box: np.ndarray) -> np.ndarray:
         """All that is shown in any frame, (points, 3), metres."""
-        motion, cloud = self.motion, _thinned(self.points)
+        motion, cloud = self.motion, thinned(self.points)
         objects = np.einsum("fij,nj->fni", motion.object_rotations, cloud) + motion.object_translations[:, None]
         boxes = np.einsum("fij,nj->fni", motion.rotations, box) + motion.translations[:, None]
         parts = [objects.reshape(-1, 3), boxes.reshape(-1, 3), self.path[:, 4:]]
@@ -156,7 +156,7 @@ def _draw(plotly, drawn: list, moving: list[dict], name: str, panel: _Panel, box
     if panel.target is not None:
         look = {"size": 1.6, "color": CLOUD}
         shares = {"scene": name, "name": "target", "legendgroup": "target", "showlegend": first}
-        drawn.append(plotly.Scatter3d(**_axes(_thinned(panel.target)), mode="markers", marker=look, **shares))
+        drawn.append(plotly.Scatter3d(**_axes(thinned(panel.target)), mode="markers", marker=look, **shares))
     shares = {"scene": name, "name": "object", "legendgroup": "object", "showlegend": first, "hoverinfo": "skip"}
     if panel.mesh is not None and len(panel.mesh.faces) <= MOST_TRIANGLES:
         vertices = np.asarray(panel.mesh.vertices, float)
@@ -166,7 +166,7 @@ def _draw(plotly, drawn: list, moving: list[dict], name: str, panel: _Panel, box
         drawn.append(plotly.Mesh3d(**_axes(vertices), i=i, j=j, k=k, color=colour, lighting=lighting, **shares))
         moves = vertices
     else:
-        moves = _thinned(panel.points)
+        moves = thinned(panel.points)
         look = {"size": 1.8, "color": matplotlib.colors.to_hex(COLOURS(0.0))}
         drawn.append(plotly.Scatter3d(**_axes(moves), mode="markers", marker=look, **shares))
     moving.append(_moving(drawn, moves, motion.object_rotations, motion.object_translations))
@@ -213,10 +213,6 @@ def _lines(corners: Float[np.ndarray, "8 3"]) -> np.ndarray:
 def _placed(corners: np.ndarray, wxyz_xyz: np.ndarray) -> np.ndarray:
     one = motion_of(np.asarray(wxyz_xyz)[None], 0, 0)
     return corners @ one.rotations[0].T + one.translations[0]
-
-
-def _thinned(points: np.ndarray) -> np.ndarray:
-    return np.asarray(points, float)[:: -(-len(points) // SHOWN_POINTS)]
 
 
 def _phase(place: float, result, last: int) -> str:

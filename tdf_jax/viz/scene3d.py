@@ -64,6 +64,15 @@ def triangles_of(mesh: "trimesh.Trimesh | None") -> Float[np.ndarray, "faces 3 3
     return np.asarray(mesh.triangles)
 
 
+def thinned(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "shown 3"]:
+    """At most `SHOWN_POINTS` points of a cloud.
+
+    Args:
+        points: the cloud, (points, 3).
+    """
+    return np.asarray(points, float)[:: -(-len(points) // SHOWN_POINTS)]
+
+
 def bounds(query: Float[np.ndarray, "queries 3"]) -> Float[np.ndarray, "8 3"]:
     """Corners of the bounding box of query points, (8, 3), metres, query frame."""
     low, high = query.min(axis=0), query.max(axis=0)
@@ -97,7 +106,7 @@ def draw(axes: Axes3D, view: View, box: Float[np.ndarray, "8 3"]) -> None:
     """
     pieces = polygons3d.Pieces([], [], [])
     if view.triangles is None:
-        cloud = view.points[:: -(-len(view.points) // SHOWN_POINTS)]
+        cloud = thinned(view.points)
         size: Any = 2.4  # square points; the declared type is that of the default
         axes.scatter(*(CENTIMETRES * cloud.T), s=size, color=CLOUD, linewidths=0, label="object's points")
     else:

@@ -17,7 +17,7 @@ from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.uncertainty.modes import Mode
 from tdf_jax.viz import polygons3d
 from tdf_jax.viz.motion import motion_of
-from tdf_jax.viz.scene3d import SHOWN_POINTS, View, bounds, content, draw, frame, triangles_of
+from tdf_jax.viz.scene3d import View, bounds, content, draw, frame, thinned, triangles_of
 from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, LIGHT, STYLE, add_axes3d, blank_figure, legend_of
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def candidates_panel(
     """
     energies = [mode.energy for mode in modes]
     scale = Normalize(energies[0], max(energies[-1], energies[0] * (1 + 1e-6)))
-    cloud = np.asarray(points)[:: -(-len(points) // SHOWN_POINTS)]
+    cloud = thinned(points)
     size: Any = 2.0
     ax.computed_zorder = False
     ax.scatter(*(CENTIMETRES * cloud.T), s=size, color=CLOUD, linewidths=0)
@@ -170,7 +170,7 @@ def surface_panel(ax: Axes3D, triangles: Float[np.ndarray, "faces 3 3"], points:
         points: the points, (points, 3), metres, world frame.
     """
     points = np.asarray(points)
-    cloud = points[:: -(-len(points) // SHOWN_POINTS)]
+    cloud = thinned(points)
     ax.computed_zorder = False
     if len(triangles):
         ax.add_collection3d(polygons3d.surface(CENTIMETRES * triangles, LIGHT).collection(), autolim=False)

@@ -55,3 +55,18 @@ def test_the_command_says_reasons_and_refuses_nothing_to_do(monkeypatch, capsys,
     for words in (["--episodes", "0"], ["--seed", "-1"], ["--tasks", "nothing"]):
         with pytest.raises(SystemExit):
             main(words)
+
+
+@pytest.mark.parametrize(
+    "words, message",
+    [
+        (["--out", "missing/rows.json"], "existing folder"),
+        (["--robot", "missing.xml", "--site", "grip"], "missing.xml"),
+    ],
+)
+def test_mistakes_are_refused_before_the_work(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(motion_study, "plan_task", lambda *about: pytest.fail("it plans"))
+    with pytest.raises(SystemExit) as stop:
+        main(words)
+    assert stop.value.code == 2 and message in capsys.readouterr().err
