@@ -25,7 +25,7 @@ from tdf_jax.sim.tasks import Episode, NotDrawn
 if TYPE_CHECKING:
     from tdf_jax.sim.robot import Robot
 
-FORMAT = 5  # format number; raise it when what becomes of an imitation changes
+FORMAT = 6  # format number; raise it when what becomes of an imitation changes
 MOST_PROCESSES = 1024  # more are a mistake
 
 

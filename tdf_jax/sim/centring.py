@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tdf_jax.sim import necks
-from tdf_jax.sim.grasps import CLEARANCE
+from tdf_jax.sim.grasps import CLEARANCE, MOST_DEPTH
 from tdf_jax.sim.pads import HALF_PAD, TIPS, flush_turn, turned_about_approach, turned_about_x
 from tdf_jax.sim.robot import Fingers
 
@@ -26,6 +26,7 @@ GRID = 0.001  # metres between points of the fitted surfaces
 FLUSH, ALONG = 0.005, 0.02  # radians; smaller turns about x and about the approach end the search
 WIDEST_TWIST = np.radians(30)  # about the approach; a wall that is turned further is another surface
 FINGER, CLOSE_BY, FARTHEST = 0.010, 0.001, 0.015  # metres: thickness of a finger, clearance, and largest withdrawal
+LEAST_DEPTH = 0.016  # metres; a cloud that is thinner than its object, such as that of one camera, asks for no less
 
 
 class Wall(NamedTuple):
@@ -65,6 +66,8 @@ def centred(
     A wall: pads press flat on one that is parallel to them; on a sloping one they touch at an edge, and the object
     turns in the hand. So the grasp moves along its closing direction to the middle, and turns about its x axis. A wall
     may bend: the last turn is the one at which it is narrowest between the pads; see `tdf_jax.sim.pads.flush_turn`.
+    Towards its floor a low bowl bends most, so the tips go no deeper below its rim than a demonstration's do, see
+    `tdf_jax.sim.grasps.grip_of`.
 
     A neck, round about an axis along the approach: the gripper comes along the axis, as deep as pads hold best (see
     `tdf_jax.sim.necks`), and where the neck is tilted it closes in the vertical plane of the axis, where what it holds
@@ -84,8 +87,31 @@ def centred(
     points = np.asarray(points, float)
     grasps = necks.neck_grasps(T, points, opening, fingers)
     if not grasps:
-        grasps = [_on_wall(T, points, opening, fingers)]
+        grasps = [_on_rim(T, points, opening, fingers)]
     return [Centred(_withdrawn(T, points, gap, fingers.tip(gap)), gap) for T, gap in grasps]
+
+
+def _on_rim(T, points, opening: float, fingers: Fingers) -> tuple[np.ndarray, float]:
+    """A grasp on the wall between the fingers, not too deep below the rim of a low bowl, and the opening."""
+    deepest = max(MOST_DEPTH * _thinnest(points), LEAST_DEPTH)
+    for _ in range(ROUNDS):
+        grasp, gap = _on_wall(T, points, opening, fingers)
+        tip = fingers.tip(max(opening - 2 * CLEARANCE, 0.0))
+        _, _, z = _between(grasp, points, HALF_PAD, opening, tip)
+        excess = tip - float(z.min()) - deepest if len(z) else 0.0
+        if excess <= CLOSE_BY:
+            break
+        T = T.copy()  # from the grasp as found: the one that is too deep was turned along another part of the wall
+        T[:3, 3] -= excess * T[:3, 2]
+    return grasp, gap
+
+
+def _thinnest(points) -> float:
+    """Extent of a cloud along the direction in which it varies least, metres: the height of a low bowl."""
+    if len(points) < LEAST:
+        return np.inf
+    _, axes = np.linalg.eigh(np.cov(points.T))
+    return float(np.ptp(points @ axes[:, 0]))
 
 
 def _on_wall(T, points, opening: float, fingers: Fingers) -> tuple[np.ndarray, float]:

@@ -160,6 +160,37 @@ def test_a_tilted_neck_is_held_where_it_swings_least(neck, robot):
     np.testing.assert_allclose(upright[0].T_world_grip[:3, 1] @ grip.T_object_grip[:3, 1], 1, atol=2e-3)
 
 
+def depth_below_rim(T, cloud, fingers):
+    """From the first point between the pads to the tips of the closed fingers, along the approach, metres."""
+    x, y, z = ((cloud - T[:3, 3]) @ T[:3, :3]).T
+    return fingers.tip(0.005) - z[(np.abs(x) < 0.011) & (np.abs(y) < 0.02)].min()
+
+
+@pytest.mark.parametrize("degrees", [-10, 0, 10])
+@pytest.mark.parametrize("seed", [3, 25, 44])
+def test_on_a_low_bowl_a_grasp_is_no_deeper_than_shown(robot, seed, degrees):
+    """Further down the wall bends into the floor, and pads that follow it slide off."""
+    shape, cloud, grip = shape_cloud_and_grip("bowl", seed, robot)
+    assert shape.height < 0.04
+    shown = depth_below_rim(grip.T_object_grip, cloud, robot.fingers)
+    deep = moved_grip(grip.T_object_grip, degrees, 0.0, robot.fingers)
+    deep[:3, 3] += 0.008 * deep[:3, 2]
+    assert depth_below_rim(deep, cloud, robot.fingers) > shown + 0.005
+    found = grasp(deep, cloud, grip, robot)
+    assert depth_below_rim(found, cloud, robot.fingers) == pytest.approx(shown, abs=0.0025)
+    assert errors(found, grip.T_object_grip, robot.fingers)[0] < 8
+
+
+def test_on_a_high_wall_a_grasp_keeps_its_depth(robot):
+    _, cloud, grip = shape_cloud_and_grip("mug", 0, robot)
+    deep = grip.T_object_grip.copy()
+    deep[:3, 3] += 0.004 * deep[:3, 2]
+    found = grasp(deep, cloud, grip, robot)
+    assert depth_below_rim(found, cloud, robot.fingers) == pytest.approx(
+        depth_below_rim(deep, cloud, robot.fingers), abs=0.0015
+    )
+
+
 def test_with_nothing_between_the_fingers_a_grasp_stays(held, robot):
     cloud, grip, _ = held
     away = grip.T_object_grip.copy()
