@@ -32,10 +32,11 @@ def measure(out: Path, settings: dict[str, Any]) -> None:
     from tdf_jax.evaluation.records import write_record
     from tdf_jax.networks.checkpoint import available_models
     from tdf_jax.sim.campaign import run_campaign
-    from tdf_jax.sim.comparison import Row, page, planned_rows, record
+    from tdf_jax.sim.comparison import page, record
     from tdf_jax.sim.condition import CLOUDS, GENERATED, MESHES, METHODS, Settings, check_settings
     from tdf_jax.sim.imitator import load_objects
     from tdf_jax.sim.physics import extra
+    from tdf_jax.sim.rows import Row, planned_rows
     from tdf_jax.sim.tasks import TASKS
 
     function = "tdf benchmark --simulation"

@@ -35,7 +35,9 @@ Modules:
     campaign: many episodes in several processes
     report: success, causes of failure, and the record of a run
     published: published success rates, and which rows stand beside them
-    comparison: rows of many campaigns beside published ones, as a page and a record
+    rows: campaigns that are planned together, and what each has shown
+    sentences: what they show together, computed from their outcomes
+    comparison: the page of many campaigns beside published rates, and their record
     recording: pictures and films of a cell
     failures: pictures of failed episodes
     viewer: MuJoCo's own viewer on a cell while it runs

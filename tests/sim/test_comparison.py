@@ -10,11 +10,13 @@ import pytest
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.sim.campaign import Run
-from tdf_jax.sim.comparison import TARGETS, Row, page, planned_rows, reading, record
+from tdf_jax.sim.comparison import page, record
 from tdf_jax.sim.condition import METHODS, Condition, Settings
 from tdf_jax.sim.episode import Outcome
 from tdf_jax.sim.physics import LIGHT_MASS
 from tdf_jax.sim.published import NDF, Published, peers_of
+from tdf_jax.sim.rows import TARGETS, Row, planned_rows
+from tdf_jax.sim.sentences import reading
 from tdf_jax.sim.tasks import TASKS
 
 GOOD = Outcome(True, True, True, True, "", "", 0.002, 1.0)
