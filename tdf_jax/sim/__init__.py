@@ -2,6 +2,7 @@
 
 Modules:
     physics: settings of the physics in one place, and the import of the engine
+    fingers: the fingers of a gripper, measured in the physics
     robot: an arm and a gripper, from a package or from a file
     grip_site: the site of the gripper's frame that a model lacks
     board: a board at a height, the shelf of the tasks

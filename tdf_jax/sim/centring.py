@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from tdf_jax.sim import necks
+from tdf_jax.sim.fingers import Fingers
 from tdf_jax.sim.grasps import CLEARANCE, MOST_DEPTH
 from tdf_jax.sim.pads import HALF_PAD, TIPS, flush_turn, turned_about_approach, turned_about_x
-from tdf_jax.sim.robot import Fingers
 
 BESIDE = 0.014  # metres, half width of the region between the fingers, along x
 BEYOND = 0.004  # metres beyond the tips of the pads, along the approach

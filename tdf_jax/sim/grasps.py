@@ -9,9 +9,9 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.sampling import sample_surface
 from tdf_jax.geometry.symmetry import ROUND
 from tdf_jax.shapes import Shape
+from tdf_jax.sim.fingers import Fingers
 from tdf_jax.sim.necks import DEPTHS, LEVEL_STEP, neck_holds
 from tdf_jax.sim.pads import HALF_PAD, flush_turn, turned_about_x
-from tdf_jax.sim.robot import Fingers
 
 CLEARANCE = 0.018  # metres between each finger and the wall before closing
 RIM_DEPTH = 0.030  # metres from the rim down the wall to the tips of the fingers

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
+from tdf_jax.sim.fingers import Fingers
 from tdf_jax.sim.pads import TIPS, flush_turn, turned_about_approach
-from tdf_jax.sim.robot import Fingers
 
 CLEARANCE, LEAST_CLEARANCE = 0.010, 0.005  # metres between each finger and a neck, whose middle the cloud shows well
 DEPTHS = (0.012, 0.049)  # metres from the end of the neck to the tips; the palm is 0.055 m behind them

@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Float
 
 from tdf_jax.sim.bodies import Body
+from tdf_jax.sim.fingers import Fingers
 from tdf_jax.sim.physics import FRICTION, SOLIMP, SOLREF, compiled, extra, set_options
-from tdf_jax.sim.robot import PREFIX, Fingers, Robot
+from tdf_jax.sim.robot import PREFIX, Robot
 
 TABLE = ((0.55, 0.0, -0.02), (0.40, 0.60, 0.02))  # centre and half edges, metres; its top is at z = 0
 # Weld between the floating gripper and the frame that drives it: as stiff as an arm's actuators hold a wrist.
