@@ -148,7 +148,7 @@ from tdf_jax.uncertainty.calibration import (
 from tdf_jax.uncertainty.covariance import pose_covariance as pose_covariance
 from tdf_jax.uncertainty.modes import cluster_poses as cluster_poses
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "available_models",

@@ -114,3 +114,15 @@ def test_every_public_name_is_in_the_reference_of_one_package():
     assert {home.split(".")[1] for home in homes} == set(packages)
     index = text(ROOT / "docs" / "index.md")
     assert all(f"(api/packages/{page.name})" in index for page in pages)
+
+
+def test_the_version_is_the_same_everywhere():
+    """The package has it; who cites and who reads of changes finds the same."""
+    found = {
+        "CITATION.cff": r"^version: (\S+)$",
+        "docs/citing.md": r"^  version = \{(\S+)\},$",
+        "CHANGELOG.md": r"^## (\d\S*)$",
+    }
+    for name, pattern in found.items():
+        first = re.search(pattern, (ROOT / name).read_text(), re.MULTILINE)
+        assert first and first[1] == tdf_jax.__version__, name
