@@ -182,7 +182,8 @@ def _judged(result: Result, weights: str, field, points, reference: Reference) -
         result = dataclasses.replace(
             result, points_at_pick=np.asarray(points_at(points, result.pick, reference.query), np.int32)
         )
-    warn_of_category("imitate()", "object", recognised, weights, "points, their unit and the weights")
+    check = "points, their unit, the weights, and whether the cloud shows enough of the object"
+    warn_of_category("imitate()", "object", recognised, weights, check)
     known: dict[str, Any] = {"recognised": recognised, "confidence": confident}
     if confident is not None and confident < DOUBT:
         known["look_from"] = look_from(field, points)

@@ -338,6 +338,58 @@ def robot():
     return tdf.load_robot()
 
 
+# An arm of three joints with two fingers that slide: each by its command, so that the gap is twice as much.
+ARM = """<mujoco>
+  <compiler angle="radian"/>
+  <worldbody>
+    <body name="base">
+      <body name="upper" pos="0 0 .1"><joint name="a" axis="0 0 1" range="-2 2" limited="true"/>
+        <geom type="capsule" size=".02" fromto="0 0 0 0 0 .3"/>
+        <body name="lower" pos="0 0 .3"><joint name="b" axis="0 1 0" range="-2 2" limited="true"/>
+          <geom type="capsule" size=".02" fromto="0 0 0 0 0 .2"/>
+          <body name="wrist" pos="0 0 .2"><joint name="c" axis="0 0 1" {free}/>
+            <geom type="box" size=".02 .06 .01"/>
+            <site name="grip" pos="0 0 .08"/>
+            {left}
+            {right}
+          </body>
+        </body>
+      </body>
+      <site name="still"/>
+    </body>
+  </worldbody>
+  <equality><joint joint1="left" joint2="right"/></equality>
+  <actuator>
+    {first}
+    <position name="B" joint="b" kp="500" kv="50"/><position name="C" joint="c" kp="500" kv="50"/>
+    {fingers}
+  </actuator>
+  {key}
+</mujoco>"""
+ARM_FINGER = """<body name="{name}" pos="0 0 .06"><joint name="{name}" type="slide" axis="0 {side} 0" range="0 .04"
+  limited="true" damping="5"/><geom type="box" pos="0 {offset} 0" size=".01 .005 .03" mass=".05"/></body>"""
+ARM_PARTS = {
+    "free": "",
+    "left": ARM_FINGER.format(name="left", side=1, offset=0.005),
+    "right": ARM_FINGER.format(name="right", side=-1, offset=-0.005),
+    "first": '<position name="A" joint="a" kp="500" kv="50"/>',
+    "fingers": '<position name="squeeze" joint="left" kp="9000" kv="50" ctrlrange="0 .04"/>',
+    "key": '<keyframe><key name="home" qpos=".3 .2 .1 0 0"/></keyframe>',
+}
+
+
+@pytest.fixture
+def arm(tmp_path):
+    """Writes the arm with some parts changed."""
+
+    def write(**parts):
+        path = tmp_path / "arm.xml"
+        path.write_text(ARM.format(**{**ARM_PARTS, **parts}))
+        return path
+
+    return write
+
+
 @pytest.fixture(scope="session")
 def corners():
     """Poses of a gripper that carries something over something, (4, 4, 4)."""

@@ -1,10 +1,11 @@
 """The blocks of code in the guides run as printed, in their order, and do what the pages say.
 
 README.md and docs/guide/camera.md have tests of their own (test_readme.py, perception/test_guide.py), and so has the
-JSON of docs/guide/evaluation.md (evaluation/test_annotated_meshes.py). The blocks of the quick start are those of
-README.md. Those of objects, uncertainty, landscape, robot and viewer need trained weights, and have no test yet.
+JSON of docs/guide/evaluation.md (evaluation/test_annotated_meshes.py). Lines of a shell that do not begin with `tdf`
+are not run: they install from the package index, or need a program that is no part of this library.
 """
 
+import ast
 import functools
 import importlib
 import re
@@ -16,10 +17,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import carried, random_cloud
+import trimesh
+from conftest import CARRY, carried, random_cloud
 
 import tdf_jax as tdf
 from tdf_jax.cli.main import COMMANDS, main
+from tdf_jax.geometry.views import visible
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -48,6 +51,22 @@ def run(tmp_path, monkeypatch):
 def assumed(small_model, demonstration):
     """The names of the README's example, with a small network."""
     return {"jax": jax, "tdf": tdf, "model": small_model, "demo": demonstration, "new": random_cloud(3).astype("f4")}
+
+
+def test_every_page_with_python_is_run():
+    with_python = {str(page.relative_to(ROOT)) for page in PAGES if blocks(page, "python")}
+    here = {f"docs/{name}" for name in re.findall(r'run\("([\w/]+\.md)"', Path(__file__).read_text())}
+    assert with_python == here | {"README.md", "docs/quickstart.md", "docs/guide/camera.md"}
+
+
+def test_the_quick_start_is_the_readme():
+    """Statement by statement, but for what is printed; test_readme.py runs them."""
+
+    def statements(page):
+        body = ast.parse("".join(blocks(page, "python"))).body
+        return [ast.unparse(one) for one in body if not ast.unparse(one).startswith("print(")]
+
+    assert statements(DOCS / "quickstart.md") == statements(ROOT / "README.md")
 
 
 def test_languages_of_blocks_are_known():
@@ -113,13 +132,18 @@ def test_demonstrations(run, tmp_path):
     assert np.ptp(again.query, axis=0).max() <= 0.06
 
 
+def save_cloud(path, points):
+    """A cloud as a text PLY; rows may be NaN."""
+    with path.open("w") as file:
+        file.write(f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n")
+        file.write("".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n")
+        np.savetxt(file, points)
+
+
 def save_recording(folder):
     """A cloud, and the 100 poses of a gripper about it, in files."""
     cloud = random_cloud(0)
-    np.savetxt(folder / "cloud.xyz", cloud)
-    header = f"ply\nformat ascii 1.0\nelement vertex {len(cloud)}\n"
-    header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
-    (folder / "cloud.ply").write_text(header + (folder / "cloud.xyz").read_text())
+    save_cloud(folder / "cloud.ply", cloud)
     start = cloud.mean(axis=0)
     tdf.save_trajectory(folder / "path.tum", tdf.line(100, start, start + [0, 0.3, 0.1]))
 
@@ -144,6 +168,8 @@ def test_devices_and_batches(run, assumed, monkeypatch):
     names = run("guide/scaling.md", assumed | {"sys": sys, "clouds": clouds, "reference": reference})
     assert names["result"].initial_trajectories.shape[0] == 512
     assert joined == [(("first-machine:7777",), {"num_processes": 2, "process_id": 1})]
+    assert len(names["picks"]) == 2 and all(pick.shape == (7,) for pick in names["picks"])
+    assert names["doubtful"] == []  # the confidence of a small network is not known
     assert names["losses"].shape == (2,) and names["trajectories"].wxyz_xyz.shape[0] == 2
 
 
@@ -167,3 +193,99 @@ def test_targets(run, small_model, demonstration):
     result = run("guide/targets.md", names)["result"]
     assert result.object_motion.shape == (7,) and result.goal.shape == (7,)
     assert result.target_trajectories.shape[1:] == (1, 7)
+
+
+def test_an_object_that_moves(run, assumed, reference):
+    result = tdf.carry(tdf.encode(assumed["model"], assumed["new"]), reference, jax.random.key(0), config=CARRY)
+    moved = assumed["new"] + np.float32([0.1, 0.0, 0.05])
+    names = run("guide/overview.md", assumed | {"moved": moved, "reference": reference, "result": result})
+    np.testing.assert_allclose(names["field"].origin, moved.mean(axis=0), atol=1e-5)
+    assert np.isfinite(names["result"].trajectory.wxyz_xyz).all()
+
+
+def test_landscapes(run, assumed, monkeypatch):
+    """On 11 points a side: 51 take ten seconds."""
+    monkeypatch.setattr(tdf, "volume_grid", lambda half, count, origin: VOLUME(half, 11, origin))
+    names = assumed | {"shown": random_cloud(0).astype("f4"), "handle": np.array([0.3, -0.2, 0.1])}
+    names = run("guide/landscape.md", names)
+    assert names["landscape"].values.shape == (7, 11, 11, 11)
+    assert names["landscape"].combined.shape == (11, 11, 11) and names["landscape"].minimisers.shape == (7, 3)
+
+
+VOLUME = tdf.volume_grid
+
+
+def test_results_in_a_notebook(run, assumed, reference, tmp_path):
+    result = tdf.carry(tdf.encode(assumed["model"], assumed["new"]), reference, jax.random.key(0), config=CARRY)
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    (tmp_path / "imitation").mkdir()
+    scene = tdf.ImitationScene(assumed["demo"], assumed["new"], result, meshes=(box, box))
+    tdf.save_imitation(tmp_path / "imitation" / "scene.npz", scene)
+    names = run("guide/viewer.md")
+    assert len(names["modes"]) >= 1 and len(names["figure"].axes) >= 2
+
+
+@pytest.mark.slow
+def test_own_object(run, tmp_path):
+    mug = tdf.build_mug(tdf.MugParameters(height=0.09, handle_style="ring", handle_top=0.075))
+    mesh = mug.mesh.copy()
+    mesh.apply_scale(100)
+    mesh.export(tmp_path / "my_mug.obj")
+    save_cloud(
+        tmp_path / "my_scan.ply", np.concatenate([tdf.sample_surface(mug.mesh, 500, 0), np.full((3, 3), np.nan)])
+    )
+    shown = tdf.build_mug()
+    handle = shown.handle_frame[:3, 3]
+    path = tdf.lift_over(5, start=handle, end=handle + [0.0, 0.3, 0.1])
+    query = tdf.box_query(jax.random.key(1), 128, size=0.06)
+    tdf.save_demonstration(
+        tmp_path / "demo.npz", tdf.Demonstration(tdf.sample_surface(shown.mesh, 1500, 1), path, query)
+    )
+    with pytest.warns(tdf.InvalidPointsWarning, match="removed 3 of 503 points"):
+        names = run("guide/objects.md")
+    assert len(names["scan"]) == 500
+    assert abs(tdf.surface_logit(names["field"], names["points"])) < 1
+    assert np.linalg.norm(names["result"].pick[4:] - mug.handle_frame[:3, 3]) < 0.02
+    np.testing.assert_allclose(names["placed"].goal, names["goal"], atol=1e-5)
+    again = tdf.load_trajectory("imitated.npz").wxyz_xyz
+    np.testing.assert_allclose(again, names["result"].trajectory.wxyz_xyz, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_uncertainty(run):
+    """The second block needs a cloud whose handle is hidden, and a camera that sees it from where the result says."""
+    mug = tdf.build_mug()
+    handle = mug.handle_frame[:3, 3]
+    path = tdf.wave(num_poses=7, start=handle, end=handle + [0.0, 0.3, 0.1])
+    demo = tdf.Demonstration(
+        tdf.sample_surface(mug.mesh, 1500, 0), path, tdf.box_query(jax.random.key(1), 128, size=0.06)
+    )
+    mesh, asked = tdf.build_mug(tdf.MugParameters(height=0.09)).mesh, []
+    whole = tdf.sample_surface(mesh, 3000, 1)
+
+    def seen_from(direction):
+        direction = np.asarray(direction) / np.linalg.norm(direction)
+        return whole[visible(mesh, whole, direction[None], np.random.default_rng(0))[0]]
+
+    def take_cloud(from_direction):
+        asked.append(np.asarray(from_direction))
+        return seen_from(from_direction)
+
+    names = {"jax": jax, "tdf": tdf, "model": tdf.load_model("mug"), "demo": demo, "take_cloud": take_cloud}
+    with pytest.warns(tdf.CategoryWarning):  # no weights are sure of a mug of which one wall is seen
+        names = run("guide/uncertainty.md", names | {"new": seen_from((-1.0, 0.0, 0.3))})
+    assert len(asked) == 1 and asked[0][0] > 0.5  # the handle is along +x
+    assert np.linalg.norm(names["result"].pick[4:] - handle) < 0.03
+    assert names["found"].covariance.shape == (6, 6)
+
+
+@pytest.mark.slow
+def test_robot(run, robot, arm, tmp_path):
+    trimesh.creation.box((0.3, 0.2, 0.08)).export(tmp_path / "shelf.obj")
+    arm().rename(tmp_path / "my_arm.xml")
+    names = run("guide/robot.md")
+    velocities = np.diff(names["safe"].positions, axis=0) / np.diff(names["safe"].times)[:, None]
+    assert 0.1 < np.abs(velocities).max() < 1.21  # the page's limit, and the noise of differences
+    np.testing.assert_array_equal(names["again"].positions, names["motion"].positions)
+    assert [part.stem for part in sorted(tmp_path.glob("*.yaml"))] == ["carry", "home", "to_pick"]
+    np.testing.assert_allclose(names["points"][:, 2], 0.1, atol=1e-12)

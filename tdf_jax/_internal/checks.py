@@ -243,7 +243,7 @@ def near(function: str, name: str, coordinates: np.ndarray, given=None) -> None:
     farthest = np.abs(coordinates).max(initial=0.0)
     if farthest > FARTHEST:
         wide = len(coordinates) < 2 or np.ptp(coordinates, axis=0).max() > SMALLEST_IN_MILLIMETRES
-        unit = f" If they are in {MILLIMETRES.name}, multiply them by {MILLIMETRES.metres:g}" if wide else ""
+        unit = f" If they are in {MILLIMETRES.name}, multiply them by {MILLIMETRES.metres:g}." if wide else ""
         raise InputError(
             f"{function}: {name} has coordinates of up to {farthest:.6g} m; expected at most {FARTHEST:g} m from the "
             f"origin, because float32 does not resolve 0.1 mm there.{unit} Subtract one offset from all clouds and "

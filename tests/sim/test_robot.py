@@ -4,63 +4,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import ARM_FINGER, ARM_PARTS
 
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.sim.workcell import build_workcell
 
 mujoco = pytest.importorskip("mujoco", reason="the extra 'sim' is not installed")
-
-# An arm of three joints with two fingers that slide: each by its command, so that the gap is twice as much.
-ARM = """<mujoco>
-  <compiler angle="radian"/>
-  <worldbody>
-    <body name="base">
-      <body name="upper" pos="0 0 .1"><joint name="a" axis="0 0 1" range="-2 2" limited="true"/>
-        <geom type="capsule" size=".02" fromto="0 0 0 0 0 .3"/>
-        <body name="lower" pos="0 0 .3"><joint name="b" axis="0 1 0" range="-2 2" limited="true"/>
-          <geom type="capsule" size=".02" fromto="0 0 0 0 0 .2"/>
-          <body name="wrist" pos="0 0 .2"><joint name="c" axis="0 0 1" {free}/>
-            <geom type="box" size=".02 .06 .01"/>
-            <site name="grip" pos="0 0 .08"/>
-            {left}
-            {right}
-          </body>
-        </body>
-      </body>
-      <site name="still"/>
-    </body>
-  </worldbody>
-  <equality><joint joint1="left" joint2="right"/></equality>
-  <actuator>
-    {first}
-    <position name="B" joint="b" kp="500" kv="50"/><position name="C" joint="c" kp="500" kv="50"/>
-    {fingers}
-  </actuator>
-  {key}
-</mujoco>"""
-FINGER = """<body name="{name}" pos="0 0 .06"><joint name="{name}" type="slide" axis="0 {side} 0" range="0 .04"
-  limited="true" damping="5"/><geom type="box" pos="0 {offset} 0" size=".01 .005 .03" mass=".05"/></body>"""
-PARTS = {
-    "free": "",
-    "left": FINGER.format(name="left", side=1, offset=0.005),
-    "right": FINGER.format(name="right", side=-1, offset=-0.005),
-    "first": '<position name="A" joint="a" kp="500" kv="50"/>',
-    "fingers": '<position name="squeeze" joint="left" kp="9000" kv="50" ctrlrange="0 .04"/>',
-    "key": '<keyframe><key name="home" qpos=".3 .2 .1 0 0"/></keyframe>',
-}
-
-
-@pytest.fixture
-def arm(tmp_path):
-    """Writes the arm with some parts changed."""
-
-    def write(**parts):
-        path = tmp_path / "arm.xml"
-        path.write_text(ARM.format(**{**PARTS, **parts}))
-        return path
-
-    return write
 
 
 def test_the_gripper_of_the_ur5e_is_measured(robot):
@@ -131,7 +81,7 @@ def test_a_hand_alone_has_neither_the_arm_nor_its_actuators(robot):
         ({"first": ""}, "the joints a of .* have no actuator; expected a position actuator"),
         ({"first": '<motor name="A" joint="a"/>'}, "the actuators A of .* do not hold a position"),
         ({"fingers": ""}, "0 actuators besides the arm's; expected one, of the fingers"),
-        ({"fingers": PARTS["fingers"] + '<motor name="z" joint="right"/>'}, "has 2 actuators besides the arm's"),
+        ({"fingers": ARM_PARTS["fingers"] + '<motor name="z" joint="right"/>'}, "has 2 actuators besides the arm's"),
         ({"free": 'type="slide"'}, "the site 'grip' of .* is not carried by an arm of hinge joints alone"),
         ({"first": "<position"}, "cannot be read"),
         ({"first": '<position name="A" joint="nothing"/>'}, "nothing"),
@@ -145,7 +95,7 @@ def test_a_file_that_is_no_arm_with_a_gripper_is_refused(arm, parts, message):
 
 def test_fingers_that_do_not_close_are_refused(arm):
     """Both on one side of the site."""
-    robot = tdf.load_robot(arm(right=FINGER.format(name="right", side=1, offset=0.03)), "grip")
+    robot = tdf.load_robot(arm(right=ARM_FINGER.format(name="right", side=1, offset=0.03)), "grip")
     with pytest.raises(InputError, match="expected two fingers on both sides along the site's y axis"):
         robot.fingers  # noqa: B018
 
