@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from flax.traverse_util import unflatten_dict
 from jax._src import compiler
 from scipy.spatial.transform import Rotation
@@ -400,6 +401,37 @@ def corners():
 def planned(robot, corners):
     """The motion of the robot along these poses, with nothing around."""
     return tdf.plan_joints(tdf.Trajectory.from_matrices(corners), robot)
+
+
+def short_playback(about=None, **outcome):
+    """An episode of three frames: a block of a robot that is there in the first two, a target, and a table."""
+    from tdf_jax.sim.condition import Condition
+    from tdf_jax.sim.playback import Playback
+    from tdf_jax.sim.solids import Solid
+    from tdf_jax.sim.workcell import OBJECT, TABLE_NAME, TARGET
+
+    condition = Condition("bowl_on_shelf", "known", "upright", "execute")._asdict()
+    known = {**condition, "seed": 0, "number": 3, "instance": "", "cause": "", "detail": "", "overall": True}
+    known |= {"strict": True, "slip": 0.002, "turn": 1.5, **(about or {}), **outcome}
+    bodies = ("robot/link", OBJECT, TARGET, TABLE_NAME)
+    poses = np.zeros((3, 4, 7))
+    poses[..., 0] = 1
+    poses[:, 0, 4:] = [(0, 0, 0.5), (0.1, 0, 0.5), (np.nan, np.nan, np.nan)]
+    poses[:, 1, 4:] = [(0.4, 0.1, 0.05), (0.4, 0.1, 0.3), (0.5, -0.2, -0.5)]
+    poses[:, 2, 4:], poses[:, 3, 4:] = (0.6, -0.2, 0.06), (0.55, 0, -0.02)
+    poses[2, 0] = np.nan
+    block = trimesh.creation.box((0.1, 0.1, 0.1))
+    ball = trimesh.creation.icosphere(2, 0.05)
+    table = trimesh.creation.box((0.8, 1.2, 0.04))
+    surfaces = (block, ball, block, table)
+    solids = [
+        Solid(name, np.asarray(mesh.vertices), np.asarray(mesh.faces), (0.2, 0.4, 0.1 * number))
+        for number, (name, mesh) in enumerate(zip(bodies, surfaces))
+    ]
+    cloud, path = np.asarray(ball.vertices, np.float32), poses[:2, 0]
+    return Playback(
+        known, np.array([0.0, 0.05, 0.1]), (("path", 0), ("settling", 2)), bodies, poses, tuple(solids), cloud, path
+    )
 
 
 @pytest.fixture(scope="session")

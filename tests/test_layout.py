@@ -32,7 +32,7 @@ MAY_IMPORT = {
     "perception": ("relation",),
     "evaluation": ("imitation", "shapes", "perception"),
     "training": ("evaluation",),
-    "sim": ("evaluation",),
+    "sim": ("evaluation", "viz"),
     "paper": ("evaluation", "landscape"),
     "viz": ("paper",),
     "plot": ("viz",),

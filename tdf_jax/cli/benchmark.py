@@ -57,6 +57,7 @@ def benchmark(
     episodes: int = 100,
     light: bool = False,
     processes: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_CORES)] = None,
+    page: bool = False,
     object_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
     target_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("benchmark"),
@@ -98,6 +99,8 @@ def benchmark(
         episodes: number of episodes in every row of --simulation; 0 for none, with --meshes.
         light: teleported objects of --simulation weigh 0.01 kg, as in NDF and R-NDF.
         processes: number of processes of --simulation, on which the outcomes do not depend.
+        page: write a page of the first failure of each cause of --simulation, to turn and play in a browser without a
+            network, in the folder runs/failures; needs the extra "pages".
         object_weights: weights of the object of --relations.
         target_weights: weights of the target of --relations.
         out: folder for the page; its folder runs keeps the computed attempts.
@@ -107,7 +110,7 @@ def benchmark(
     from tdf_jax.evaluation.annotated_meshes import load_annotated
     from tdf_jax.evaluation.demonstration_count import count_errors
     from tdf_jax.evaluation.path_methods import METHODS
-    from tdf_jax.evaluation.path_report import page, record, sections
+    from tdf_jax.evaluation.path_report import page as report, record, sections
     from tdf_jax.evaluation.path_scores import run, score
     from tdf_jax.evaluation.records import write_record
     from tdf_jax.geometry.winding import libigl
@@ -130,6 +133,7 @@ def benchmark(
             "--targets": (targets is not None, (simulated,)), "--masks": (masks != ("segmented",), (simulated,)),
             "--episodes": (episodes != 100, (simulated,)),
             "--light": (light, (simulated,)), "--processes": (processes is not None, (simulated,)),
+            "--page": (page, (simulated,)),
         },
     )  # fmt: skip
     if simulation:
@@ -144,6 +148,7 @@ def benchmark(
                 "seed": seed, "processes": processes, "meshes": None if meshes is None else str(meshes),
                 "recursive": recursive, "num_poses": num_poses,
             },
+            page,
         )  # fmt: skip
     methods = _given(methods, ("all",))
     if relations:
@@ -189,7 +194,7 @@ def benchmark(
     picks = count_errors(makers, model, demonstrations, folder, seed=seed)
     extras = sections(scores, picks)
     write_record("tdf benchmark", out / RECORD, record(scores, model, settings, extras), indent=None)
-    replace_file("tdf benchmark", out / PAGE, page(scores, model, settings, extras).encode())
+    replace_file("tdf benchmark", out / PAGE, report(scores, model, settings, extras).encode())
     print(out / PAGE)
     _draw(out, makers, scores, extras)
 

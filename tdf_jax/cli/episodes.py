@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from tdf_jax.cli.pictures import Pictures
     from tdf_jax.sim.campaign import Run
     from tdf_jax.sim.condition import Settings
 
@@ -14,12 +15,13 @@ PAGE, FOLDER, RECORD, RUNS = "simulation.md", "simulation", "simulation.json", "
 FAILURES, SHEET = "failures", "failures.png"  # folder of pictures, and all in one
 
 
-def measure(out: Path, settings: dict[str, Any]) -> None:
+def measure(out: Path, settings: dict[str, Any], pages: bool = False) -> None:
     """Run all rows, or read what was kept of them, and write the page and the record.
 
     Args:
         out: folder of the page; its folder runs keeps the outcomes.
         settings: options of the command by name.
+        pages: whether to write a page of the first failure of each cause as well.
 
     Raises:
         InputError: an option is wrong, the extra "sim" is not installed, or the folder cannot be written.
@@ -29,6 +31,7 @@ def measure(out: Path, settings: dict[str, Any]) -> None:
     from tdf_jax._internal import checks
     from tdf_jax._internal.errors import InputError
     from tdf_jax._internal.files import replace_file
+    from tdf_jax.cli.pictures import check_page
     from tdf_jax.evaluation.records import write_record
     from tdf_jax.networks.checkpoint import available_models
     from tdf_jax.sim.campaign import run_campaign
@@ -40,6 +43,8 @@ def measure(out: Path, settings: dict[str, Any]) -> None:
     from tdf_jax.sim.tasks import TASKS
 
     function = "tdf benchmark --simulation"
+    if pages:
+        check_page(function)
     checks.count(function, "--episodes", settings["episodes"], 1 if settings["meshes"] is None else 0)
     if settings["recursive"] and settings["meshes"] is None:
         raise InputError(f"{function}: --recursive is of --meshes; expected both, or neither")
@@ -99,20 +104,23 @@ def measure(out: Path, settings: dict[str, Any]) -> None:
     write()  # before pictures, which may fail
     print(out / PAGE)
     folder = out / RUNS / FAILURES
-    if draw_failures(function, [(row.settings, row.all) for row in rows], folder):
+    if draw_failures(function, [(row.settings, row.all) for row in rows], folder, pages):
         replace_file(function, out / FOLDER / SHEET, (folder / SHEET).read_bytes())
         write(f"{FOLDER}/{SHEET}")
 
 
-def draw_failures(function: str, rows: "Sequence[tuple[Settings, Sequence[Run]]]", folder: Path) -> bool:
+def draw_failures(
+    function: str, rows: "Sequence[tuple[Settings, Sequence[Run]]]", folder: Path, page: bool = False
+) -> bool:
     """Draw the first failed episode of each cause, and all of them on one sheet.
 
-    Where nothing renders off screen, one line says so, and nothing is drawn.
+    Where nothing renders off screen, one line says so, and no picture is drawn.
 
     Args:
         function: begins the messages.
         rows: campaigns, and their episodes.
         folder: folder of the pictures, made if something failed; those of earlier runs stay unless they are replaced.
+        page: whether to write a page of each as well, beside its picture.
 
     Returns:
         Whether there are pictures.
@@ -126,24 +134,56 @@ def draw_failures(function: str, rows: "Sequence[tuple[Settings, Sequence[Run]]]
     from tdf_jax._internal.files import replace_file
     from tdf_jax.cli.pictures import Pictures
     from tdf_jax.sim.failures import check_renderer, failure_sheet, first_failures, picture_failures
-    from tdf_jax.sim.recording import write_frame
+    from tdf_jax.viz.film_file import write_frame
 
     failed = first_failures(rows)
     if not failed:
         return False
+    pictures = Pictures(function)
+    if page:
+        for settings, run in failed:
+            write_episode_page(function, settings, run.number, folder / f"{_name(settings, run)}.html", pictures)
     try:
         check_renderer()
     except InputError as error:
         print(f"{function}: no pictures of failures: {error}", file=sys.stderr)
+        pictures.check()
         return False
-    pictures = Pictures(function)
     with pictures.drawing(folder / SHEET):
         folder.mkdir(parents=True, exist_ok=True)
         drawn = picture_failures(failed)
         for (settings, run), pixels in zip(failed, drawn):
-            condition = settings.condition
-            words = (condition.task, condition.mode, condition.target, condition.poses, run.number, run.outcome.cause)
-            write_frame(folder / f"{'-'.join(map(str, words)).replace(' ', '_')}.png", pixels)
+            write_frame(folder / f"{_name(settings, run)}.png", pixels)
         replace_file(function, folder / SHEET, failure_sheet(drawn))
     pictures.check()
     return True
+
+
+def write_episode_page(function: str, settings: "Settings", number: int, path: Path, pictures: "Pictures") -> None:
+    """Write the page of an episode that the folder of a campaign keeps.
+
+    Args:
+        function: begins the messages.
+        settings: the campaign.
+        number: number of the episode.
+        path: the page; its folder is made if it does not exist.
+        pictures: notes it as missing if it cannot be drawn or written.
+    """
+    from tdf_jax._internal.errors import InputError
+    from tdf_jax.sim.campaign import about_episode
+    from tdf_jax.sim.playback import kept_episode, load_playback
+    from tdf_jax.sim.playback_page import save_playback_page
+
+    with pictures.drawing(path):
+        kept = kept_episode(function, settings.folder, about_episode(settings, number))
+        if kept is None:
+            raise InputError(f"episode {number} was run before episodes were kept; expected another --out")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_playback_page(path, load_playback(function, kept))
+
+
+def _name(settings: "Settings", run: "Run") -> str:
+    """Name of the picture and the page of a failure."""
+    condition = settings.condition
+    words = (condition.task, condition.mode, condition.target, condition.poses, run.number, run.outcome.cause)
+    return "-".join(map(str, words)).replace(" ", "_")

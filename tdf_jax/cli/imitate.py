@@ -156,8 +156,8 @@ def _run(settings: Settings, folder: Path, pictures: Pictures) -> dict:
             save_imitation_page(path, shown, title)
     if settings.animation is not None:
         with _timed(seconds, "animation"), pictures.drawing(settings.animation) as path:
-            from tdf_jax.sim.recording import save_film
             from tdf_jax.viz.film import RATE, film_frames
+            from tdf_jax.viz.film_file import save_film
 
             save_film(path, list(film_frames(shown)), RATE)
     seconds["total"] = time.perf_counter() - began

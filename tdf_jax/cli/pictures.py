@@ -78,7 +78,7 @@ def check_animation(function: str, path: Path) -> None:
     Raises:
         InputError: the ending is none of a film, the folder does not exist, or the encoder is not installed.
     """
-    from tdf_jax.sim.recording import ENDINGS, check_encoder
+    from tdf_jax.viz.film_file import ENDINGS, check_encoder
 
     if path.suffix.lower() not in ENDINGS:
         raise InputError(f"{function}: --animation is {path}; expected a name that ends in {' or '.join(ENDINGS)}")

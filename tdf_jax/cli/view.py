@@ -1,4 +1,4 @@
-"""`tdf view`: an imitation or a landscape in a browser."""
+"""`tdf view`: an imitation, a landscape or simulated episodes in a browser."""
 
 import threading
 from pathlib import Path
@@ -20,6 +20,7 @@ def view(
     demonstrate: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=_NONE)] = None,
     scale: float = 1.0,
     landscape: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint=_NONE)] = None,
+    episode: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: the first)")] = None,
     weights: Annotated[
         str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint="(default: those of the folder)")
     ] = None,
@@ -31,15 +32,17 @@ def view(
 
     It needs the extra "viewer".
 
-    The object and its goal can be dragged: the pick is found again, and the path follows. The address is this machine's
-    own.
+    The object and its goal can be dragged: the pick is found again, and the path follows. Simulated episodes are
+    played. The address is this machine's own.
 
     Args:
-        folder: folder that `tdf imitate` or `tdf landscape` wrote; with --demonstrate, mesh or cloud of the object.
+        folder: folder that `tdf imitate`, `tdf landscape`, `tdf simulate` or `tdf benchmark --simulation` wrote; with
+            --demonstrate, mesh or cloud of the object.
         demonstrate: .npz file for a demonstration that is made by hand on the object: drag a box of query points along
             key poses.
         scale: metres per unit of the object's file, such as 0.01 for centimetres.
         landscape: folder of `tdf landscape` to show with an imitation.
+        episode: number of the simulated episode that is shown first.
         weights: weights of the object, if they are not where the folder says.
         port: port of the address; 0 for any that is free.
         share: make a public link as well, by the relay of viser's authors: whoever has it sees and moves everything.
@@ -47,30 +50,46 @@ def view(
     """
     from tdf_jax.landscape.storage import load_landscape
     from tdf_jax.solvers.imitation_scene import SCENE, load_imitation
+    from tdf_jax.viewer.energies import show_landscape
+    from tdf_jax.viewer.episodes import EpisodeStage
+    from tdf_jax.viewer.handles import look
     from tdf_jax.viewer.local_server import serving, viser_of
     from tdf_jax.viewer.solving import model_of, problem_of
-    from tdf_jax.viewer.stage import Stage, look, show_landscape
+    from tdf_jax.viewer.stage import Stage
 
     viser_of("tdf view")
     if demonstrate is not None:
-        if landscape is not None or weights is not None:
-            raise InputError("tdf view: --demonstrate has no use for --landscape and --weights; drop them")
+        if landscape is not None or weights is not None or episode is not None:
+            raise InputError("tdf view: --demonstrate has no use for --landscape, --episode and --weights; drop them")
         _demonstrate(folder, demonstrate, scale, port, share, no_browser)
         return
     if scale != 1:
         raise InputError("tdf view: --scale is for an object with --demonstrate; give that, or drop --scale")
     if folder.is_file() and folder.suffix != ".npz":
         raise InputError(
-            f"tdf view: {folder} is a file; expected a folder of `tdf imitate` or `tdf landscape`. To make a "
-            "demonstration on an object, add --demonstrate FILE"
+            f"tdf view: {folder} is a file; expected a folder of `tdf imitate`, `tdf landscape` or `tdf simulate`. To "
+            "make a demonstration on an object, add --demonstrate FILE"
         )
+    simulated = _simulated(folder)
+    if simulated is not None:
+        if landscape is not None or weights is not None:
+            raise InputError(f"tdf view: {folder} holds simulated episodes; drop --landscape and --weights")
+        with serving("tdf view", port) as server:
+            episodes = EpisodeStage(server, simulated, episode)
+            try:
+                _wait(server, share, no_browser)
+            finally:
+                episodes.close()
+        return
+    if episode is not None:
+        raise InputError(f"tdf view: {folder} is no folder of `tdf simulate`; expected one for --episode; drop it")
     alone = not (folder / SCENE).exists() and (folder / "landscape.npz").is_file()
     if alone and landscape is not None:
         raise InputError(f"tdf view: {folder} is a landscape, and there is --landscape {landscape}; drop one")
     if not alone and folder.is_dir() and not (folder / SCENE).is_file() and any(folder.iterdir()):
         raise InputError(
-            f"tdf view: {folder} has neither {SCENE} nor landscape.npz; expected a folder of `tdf imitate` or "
-            "`tdf landscape`, which it shows. Of `tdf simulate` and other commands, see the pictures and films"
+            f"tdf view: {folder} has no {SCENE}, landscape.npz or episodes; expected a folder of `tdf imitate`, "
+            "`tdf landscape` or `tdf simulate` of this version. Of other commands, see the pictures"
         )
     file = folder / "landscape.npz" if alone else None if landscape is None else landscape / "landscape.npz"
     energies = None if file is None else load_landscape(file)[0]
@@ -88,6 +107,13 @@ def view(
         finally:
             if stage is not None:
                 stage.close()
+
+
+def _simulated(folder: Path) -> Path | None:
+    """The folder of simulated episodes: this one, or that of the runs in the folder of a benchmark."""
+    from tdf_jax.sim.playback import FOLDER
+
+    return next((one for one in (folder, folder / "runs") if (one / FOLDER).is_dir()), None)
 
 
 def _demonstrate(file: Path, path: Path, scale: float, port: int, share: bool, no_browser: bool) -> None:

@@ -40,6 +40,9 @@ Modules:
     sentences: what they show together, computed from their outcomes
     comparison: the page of many campaigns beside published rates, and their record
     recording: pictures and films of a cell
+    solids: what the bodies of a cell look like, by few triangles
+    playback: what a picture of an episode needs, and its file
+    playback_page: the page of an episode
     failures: pictures of failed episodes
     viewer: MuJoCo's own viewer on a cell while it runs
 """

@@ -3,19 +3,20 @@
 import concurrent.futures
 import contextlib
 import dataclasses
+import json
 import math
 import multiprocessing
 import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tqdm.auto import tqdm
 
 from tdf_jax._internal import checks, workers
-from tdf_jax._internal.cache import kept
+from tdf_jax._internal.cache import digest, kept
 from tdf_jax._internal.errors import InputError
 from tdf_jax.sim.condition import Condition, Settings, check_settings
 from tdf_jax.sim.episode import NOT_DRAWN, NOT_FOUND, Outcome
@@ -174,6 +175,7 @@ def _kept(settings: Settings, number: int, view: bool = False) -> dict[str, np.n
 def _run(imitator: Imitator, number: int, view: bool = False) -> dict:
     """Imitate and run one episode: arrays to keep."""
     from tdf_jax.sim.episode import run_episode, teleport
+    from tdf_jax.sim.playback import FOLDER, Sampler, save_playback
     from tdf_jax.sim.viewer import Viewer
 
     condition, scan = imitator.condition, imitator.scan(number)
@@ -186,6 +188,7 @@ def _run(imitator: Imitator, number: int, view: bool = False) -> dict:
             **dataclasses.asdict(Outcome.failure(NOT_DRAWN, str(error))),
             **{"rejected": error.rejected, "redrawn": error.redrawn, "seconds": (0.0, 0.0, 0.0), "instance": instance},
         }
+    sampler = Sampler(episode, imitator.robot)
     began = planned = time.perf_counter()
 
     def plan_ends():
@@ -195,19 +198,52 @@ def _run(imitator: Imitator, number: int, view: bool = False) -> dict:
     if not len(found.paths):
         outcome = Outcome.failure(NOT_FOUND, found.reason)
     elif condition.mode == "execute":
-        with watched(Viewer) as (watch, _):
-            watch = watch if view else None
+        with watched(Viewer) as (show, _):
+
+            def watch(cell, data, phase):
+                sampler.watch(cell, data, phase)
+                if view:
+                    show(cell, data, phase)
+
             candidates = list(found.paths), found.openings.tolist()
             outcome = run_episode(episode, imitator.robot, *candidates, watch=watch, planned=plan_ends)
     else:
-        outcome = teleport(episode, imitator.robot, found.paths[0, 0], found.motion, found.openings[0])
+        pick, opening = found.paths[0, 0], found.openings[0]
+        outcome = teleport(episode, imitator.robot, pick, found.motion, opening, watch=sampler.watch)
+    seconds = (found.seconds, time.perf_counter() - began, planned - began)
+    path = found.paths[0] if len(found.paths) else np.zeros((0, 4, 4))
+    about = _described(imitator.settings, number, instance, outcome)
+    name = _file_name(imitator, number)
+    save_playback("tdf simulate", imitator.settings.folder / FOLDER, name, sampler.playback(about, found.points, path))
     return {
         **dataclasses.asdict(outcome),
         "rejected": episode.rejected,
         "redrawn": episode.redrawn,
-        "seconds": (found.seconds, time.perf_counter() - began, planned - began),
+        "seconds": seconds,
         "instance": instance,
     }
+
+
+def _file_name(imitator: Imitator, number: int) -> str:
+    """Name of the file of an episode: what it is for the reader, and a digest of all that it depends on."""
+    condition = imitator.condition
+    words = (condition.task, condition.mode, condition.target, condition.poses, condition.method, f"{number:04d}")
+    about = digest(json.dumps([*imitator.depends_on(number), *condition], sort_keys=True).encode())
+    return f"{'-'.join(words).replace(' ', '_')}-{about[:8]}"
+
+
+def about_episode(settings: Settings, number: int) -> dict[str, Any]:
+    """What an episode is measured under, in types of JSON; see `tdf_jax.sim.playback.Playback`."""
+    return {**settings.condition._asdict(), "seed": settings.seed, "number": number}
+
+
+def _described(settings: Settings, number: int, instance: str, outcome: Outcome) -> dict[str, Any]:
+    """What an episode was and what became of it."""
+    results = {name: getattr(outcome, name) for name in ("overall", "strict", "cause", "detail")}
+    for name in ("slip", "turn"):
+        value = float(getattr(outcome, name))
+        results[name] = None if math.isnan(value) else value
+    return about_episode(settings, number) | {"instance": instance} | results
 
 
 def found_in(settings: Settings, number: int) -> tuple[Episode, "Robot", Found]:

@@ -128,6 +128,7 @@ def teleport(
     pick: Float[np.ndarray, "4 4"],
     motion: Float[np.ndarray, "4 4"],
     opening: float | None = None,
+    watch: Callable[[Workcell, Any, str], None] | None = None,
 ) -> Outcome:
     """The protocol of NDF and R-NDF: grasp and place are tested apart, and the object is reset to where it is placed.
 
@@ -142,6 +143,8 @@ def teleport(
         pick: pose of the gripper's frame at the pick, 4x4, metres, world frame.
         motion: motion M of the object: a point x of it ends at M x, 4x4.
         opening: opening of the fingers before they close, metres; by default that of the true grasp.
+        watch: called every few steps with the cell, the state and the phase, first of the grasp test, and then of the
+            placement.
     """
     release = motion @ pick
     grasp = test_grasp(
@@ -152,8 +155,9 @@ def teleport(
         episode.grip.opening if opening is None else opening,
         rotation=release[:3, :3],
         fixture=episode.fixture,
+        watch=watch,
     )
-    placed, cause, detail, criteria = _reset(episode, motion @ episode.T_world_object)
+    placed, cause, detail, criteria = _reset(episode, motion @ episode.T_world_object, watch)
     if not grasp.held:
         wrong = _pick_error(episode, pick)
         cause = "pick wrong" if wrong else "slipped"
@@ -184,7 +188,8 @@ def run_episode(
         openings: opening of the fingers before they close, of each, (candidates,), metres; by default that of the true
             grasp.
         seed: seed of the planner.
-        watch: called every few steps with the cell, the state and the phase, such as `Recorder`.
+        watch: called every few steps with the cell, the state and the phase, such as `Recorder`; until the object has
+            settled.
         planned: called when there is a plan, or none: the physics begins.
         noted: called with the cell, the state and a word when something happens: "closed", "collided", "struck" (the
             hand and the target), "lost" (from the hand), and "end".
@@ -201,7 +206,7 @@ def run_episode(
     observer = _Observer(cell, watch, noted)
     centre = np.linalg.inv(plan.pick) @ episode.T_world_object @ np.append(episode.object_body.centre, 1.0)
     execute(cell, data, plan.motion, observer, Payload(episode.object_body.mass, centre[:3]))
-    contacts = settle(cell, data)
+    contacts = settle(cell, data, watch)
     observer.note(data, "end")
     placed, cause, detail, criteria = _judged(episode, cell, data, contacts)
     criteria["no_collision"] = not observer.collided
@@ -288,11 +293,11 @@ class _Observer:
         return np.linalg.inv(self.cell.gripper_pose(data)) @ self.cell.body_pose(data, OBJECT)
 
 
-def _reset(episode: Episode, T_world_object) -> Verdict:
+def _reset(episode: Episode, T_world_object, watch=None) -> Verdict:
     """Reset the object, let 2 s pass, and judge."""
     cell = reset_cell(episode, T_world_object)
     data = cell.data()
-    verdict = _judged(episode, cell, data, settle(cell, data))
+    verdict = _judged(episode, cell, data, settle(cell, data, watch))
     comes_off = _comes_off(episode, cell.body_pose(data, OBJECT), cell.body_pose(data, TARGET))
     verdict.criteria["comes_off"] = comes_off
     if verdict.placed and not comes_off:
@@ -348,12 +353,15 @@ def _comes_off(episode: Episode, T_object, T_target) -> bool:
     return bool(np.linalg.norm(turned.body_pose(data, OBJECT)[:3, 3] - T_object[:3, 3]) >= FALLS)
 
 
-def settle(cell: Workcell, data: Any) -> set[tuple[int, int]]:
+def settle(
+    cell: Workcell, data: Any, watch: Callable[[Workcell, Any, str], None] | None = None
+) -> set[tuple[int, int]]:
     """Let 2 s pass.
 
     Args:
         cell: the cell.
         data: its state, which changes.
+        watch: called every few steps with the cell, the state and the phase.
 
     Returns:
         Pairs of kinds of geoms (see `tdf_jax.sim.collision`), the smaller number first, that met in the last 0.1 s.
@@ -364,6 +372,8 @@ def settle(cell: Workcell, data: Any) -> set[tuple[int, int]]:
         mujoco.mj_step(cell.model, data)
         if step >= steps - round(LAST / TIMESTEP):
             contacts |= _contacts(kinds, data)
+        if watch is not None and (step % WATCHED == 0 or step == steps - 1):
+            watch(cell, data, "settling")
     return contacts
 
 

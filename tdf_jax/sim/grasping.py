@@ -1,6 +1,8 @@
 """The grasp test: does a pose of the gripper hold the object, lifted, turned and held, by friction alone."""
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -49,6 +51,7 @@ def test_grasp(
     grip: float = 0.0,
     rotation: Float[np.ndarray, "3 3"] | None = None,
     fixture: bool = False,
+    watch: Callable[[Workcell, Any, str], None] | None = None,
 ) -> Grasp:
     """Close a floating gripper on an object, lift it by 15 cm, turn it as at the release, and hold it for 2 s.
 
@@ -61,9 +64,10 @@ def test_grasp(
         grip: opening that is commanded to hold, metres.
         rotation: orientation of the gripper's frame at the release, 3x3, world frame; that of the pick by default.
         fixture: whether a fixture holds the object until the fingers have closed.
+        watch: called after every step with the cell, the state and the phase.
     """
     cell = build_workcell(robot, one, T_world_object, floating=True, fixture=fixture)
-    hand = FloatingHand(cell, T_world_grip, opening)
+    hand = FloatingHand(cell, T_world_grip, opening, watch)
     data = hand.data
     struck = hand.penetration()
     before = cell.body_pose(data, OBJECT)
@@ -100,10 +104,16 @@ class FloatingHand:
         data: its state.
     """
 
-    def __init__(self, cell: Workcell, T_world_grip: Float[np.ndarray, "4 4"], opening: float):
-        """Place the gripper, its fingers open."""
+    def __init__(
+        self,
+        cell: Workcell,
+        T_world_grip: Float[np.ndarray, "4 4"],
+        opening: float,
+        watch: Callable[[Workcell, Any, str], None] | None = None,
+    ):
+        """Place the gripper, its fingers open; `watch` is called as by `test_grasp`."""
         mujoco = extra("FloatingHand", "mujoco")
-        self.cell, self.data, self._mujoco = cell, cell.data(), mujoco
+        self.cell, self.data, self._mujoco, self._watch = cell, cell.data(), mujoco, watch
         model = cell.model
         root = model.body(int(model.joint(HAND).bodyid[0])).name
         self._T_site_root = np.linalg.inv(cell.gripper_pose(self.data)) @ cell.body_pose(self.data, root)
@@ -127,7 +137,7 @@ class FloatingHand:
     def wait(self, seconds: float) -> None:
         """Let time pass."""
         for _ in range(int(round(seconds / TIMESTEP))):
-            self._mujoco.mj_step(self.cell.model, self.data)
+            self._step()
 
     def move(self, T: Float[np.ndarray, "4 4"], seconds: float) -> None:
         """Move the gripper's frame to a pose, 4x4, straight and turning as `level_rotations` does, smoothly."""
@@ -138,8 +148,13 @@ class FloatingHand:
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = rotation, start[:3, 3] + share * (T[:3, 3] - start[:3, 3])
             self._drive(pose)
-            self._mujoco.mj_step(self.cell.model, self.data)
+            self._step()
         self._pose = np.array(T, float)
+
+    def _step(self) -> None:
+        self._mujoco.mj_step(self.cell.model, self.data)
+        if self._watch is not None:
+            self._watch(self.cell, self.data, "grasp test")
 
     def penetration(self) -> float:
         """Deepest penetration of hand and object, metres."""

@@ -51,6 +51,7 @@ class Found(NamedTuple):
         motion: motion M of the object: a point x of it ends at M x, 4x4.
         reason: why nothing is found, in words; empty if something is.
         seconds: time that it took when it was computed, without that of describing the demonstration.
+        points: cloud of the object, (points, 3), metres, world frame; empty if none was needed or seen.
     """
 
     paths: Float[np.ndarray, "paths poses 4 4"]
@@ -58,6 +59,7 @@ class Found(NamedTuple):
     motion: Float[np.ndarray, "4 4"]
     reason: str
     seconds: float
+    points: Float[np.ndarray, "points 3"]
 
 
 def load_objects(settings: Settings) -> "list[Scan]":
@@ -253,7 +255,9 @@ class Imitator:
             else:
                 openings = np.array([opening for several in centred for _, opening in several])
                 paths = np.array([path for several in centred for path, _ in several])
-        return Found(paths, openings, result["motion"], result["reason"].item(), float(result["seconds"]))
+        return Found(
+            paths, openings, result["motion"], result["reason"].item(), float(result["seconds"]), result["points"]
+        )
 
     def _found(self, episode: Episode, shown: int) -> dict[str, Any]:
         """Arrays to keep: those of `Found`, not centred, and the object's cloud."""

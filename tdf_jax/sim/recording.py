@@ -2,11 +2,8 @@
 
 import copy
 import importlib
-import io
 import os
 import platform
-import tempfile
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +12,6 @@ from numpy.typing import ArrayLike
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
-from tdf_jax._internal.files import replace_file
 from tdf_jax.sim.physics import extra
 from tdf_jax.sim.robot import PREFIX
 from tdf_jax.sim.workcell import TABLE_NAME
@@ -30,9 +26,7 @@ GROUND_COLOUR, WOOD, STEEL = (0.80, 0.83, 0.86, 1.0), (0.62, 0.58, 0.53, 1.0), (
 LIGHTS = (((-0.25, 0.35, -1.0), 0.45, True), ((0.8, 0.4, -0.7), 0.22, False))
 AMBIENT, HEADLIGHT = 0.42, 0.14
 SAMPLES, SHADOW = 4, 2048  # of a pixel, and texels of a shadow's map
-COLOURS_OF_GIF = 256
 CONTEXTS = {"egl": "mujoco.egl", "osmesa": "mujoco.osmesa", "glfw": "mujoco.glfw", "cgl": "mujoco.cgl"}
-ENDINGS = (".gif", ".mp4")
 
 
 class Recorder:
@@ -164,12 +158,14 @@ class Recorder:
         """Save the film.
 
         Args:
-            path: file to write, in an existing folder: `.gif`, or `.mp4` if the package imageio-ffmpeg is installed.
+            path: file to write, in an existing folder: `.gif`, or `.mp4` with the extra "films".
 
         Raises:
             InputError: there are no pictures, the ending is another one, imageio-ffmpeg is missing, or the file cannot
                 be written.
         """
+        from tdf_jax.viz.film_file import save_film
+
         save_film(path, self.frames, self.rate)
 
     def _furnish(self) -> None:
@@ -222,56 +218,6 @@ class Recorder:
             scene.nlight += 1
 
 
-def write_frame(path: str | os.PathLike, pixels: UInt8[np.ndarray, "height width 3"]) -> None:
-    """Write a picture as PNG.
-
-    Args:
-        path: file to write, in an existing folder, `.png`.
-        pixels: the picture, (height, width, 3), 0 to 255.
-
-    Raises:
-        InputError: the ending is another one, `pixels` is no picture, or the file cannot be written.
-    """
-    _ending("write_frame()", path, (".png",))
-    replace_file("write_frame()", path, _encoded(_image("write_frame()", pixels), "PNG"))
-
-
-def save_film(path: str | os.PathLike, frames: list[UInt8[np.ndarray, "height width 3"]], rate: float = RATE) -> None:
-    """Write pictures as a film; see `Recorder.save`.
-
-    Args:
-        path: file to write, `.gif` or `.mp4`.
-        frames: pictures of one size, (height, width, 3) each, 0 to 255.
-        rate: pictures a second.
-
-    Raises:
-        InputError: see `Recorder.save`.
-    """
-    name = "save_film()"
-    checks.number(name, "rate", checks.positive(name, "rate", rate), most=50.0)
-    ending = _ending(name, path, ENDINGS)
-    images = [_image(name, frame) for frame in frames]
-    if not images:
-        raise InputError(f"{name}: there are no pictures; let the recorder watch the run, or take() one")
-    if len({image.size for image in images}) > 1:
-        raise InputError(f"{name}: the pictures have several sizes; expected one")
-    content = _gif(images, rate) if ending == ".gif" else _mp4(frames, rate)
-    replace_file(name, path, content)
-
-
-def check_encoder(path: str | os.PathLike) -> None:
-    """Raise InputError unless a film can be saved under a name; nothing is written.
-
-    Args:
-        path: file that is to be written, `.gif` or `.mp4`.
-
-    Raises:
-        InputError: the ending is another one, or imageio-ffmpeg is missing.
-    """
-    if _ending("save_film()", path, ENDINGS) == ".mp4":
-        _ffmpeg()
-
-
 def check_film(path: str | os.PathLike) -> None:
     """Raise InputError unless films can be rendered here, and saved under a name; nothing is written.
 
@@ -283,6 +229,8 @@ def check_film(path: str | os.PathLike) -> None:
     Raises:
         InputError: nothing renders off screen here, or see `Recorder.save`.
     """
+    from tdf_jax.viz.film_file import check_encoder
+
     check_encoder(path)
     mujoco = extra("Recorder", "mujoco")
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
@@ -327,63 +275,3 @@ def gl_context(width: int, height: int) -> Any:
 
 def _has_screen() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def _ending(function: str, path, endings: tuple[str, ...]) -> str:
-    ending = checks.path(function, path).suffix.lower()
-    if ending not in endings:
-        raise InputError(f"{function}: got {path}; expected a name that ends in {' or '.join(endings)}")
-    return ending
-
-
-def _image(function: str, pixels) -> Any:
-    from PIL import Image
-
-    if not isinstance(pixels, np.ndarray) or pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
-        got = f"{pixels.dtype} {pixels.shape}" if isinstance(pixels, np.ndarray) else type(pixels).__name__
-        raise InputError(f"{function}: got a picture of {got}; expected uint8 (height, width, 3)")
-    return Image.fromarray(pixels)
-
-
-def _encoded(image, kind: str, **options) -> bytes:
-    content = io.BytesIO()
-    image.save(content, kind, **options)
-    return content.getvalue()
-
-
-def _gif(images: list, rate: float) -> bytes:
-    """One palette for all pictures, so that colours do not flicker, and no dither, which would be most of the file."""
-    from PIL import Image
-
-    some = images[:: max(len(images) // 8, 1)][:9]
-    width, height = some[0].size
-    sheet = Image.new("RGB", (width, height * len(some)))
-    for number, image in enumerate(some):
-        sheet.paste(image, (0, number * height))
-    palette = sheet.quantize(COLOURS_OF_GIF, method=Image.Quantize.MEDIANCUT)
-    first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
-    ticks = np.diff(np.round(np.arange(len(images) + 1) * 100 / rate))  # a GIF counts hundredths of a second
-    options = {"save_all": True, "append_images": others, "duration": (10 * ticks).astype(int).tolist(), "loop": 0}
-    return _encoded(first, "GIF", **options)
-
-
-def _mp4(frames: list[np.ndarray], rate: float) -> bytes:
-    ffmpeg, (height, width) = _ffmpeg(), frames[0].shape[:2]
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "film.mp4"
-        writer = ffmpeg.write_frames(str(file), (width, height), fps=rate, quality=8, macro_block_size=2)
-        writer.send(None)
-        for frame in frames:
-            writer.send(np.ascontiguousarray(frame))
-        writer.close()
-        return file.read_bytes()
-
-
-def _ffmpeg() -> Any:
-    try:
-        return importlib.import_module("imageio_ffmpeg")
-    except ImportError:
-        raise InputError(
-            "save_film(): MP4 needs the package imageio-ffmpeg, which is not installed; pip install imageio-ffmpeg, or "
-            "write a .gif"
-        ) from None

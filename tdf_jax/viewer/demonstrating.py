@@ -17,7 +17,7 @@ from tdf_jax.geometry.query import box_query
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.io.demonstrations import check_frames, save_demonstration
 from tdf_jax.viewer import handles, solving
-from tdf_jax.viewer.stage import GRIP, REACH, look
+from tdf_jax.viewer.stage import GRIP, REACH
 from tdf_jax.viz.style import COLOURS, INK
 
 QUERIES, NUM_POSES = 128, 20  # query points, and poses from the grasp to the release
@@ -125,7 +125,7 @@ class HandStage:
         self._keys: list[Any] = []
         self._grip.on_update(lambda _: self._follow())
         room = np.concatenate([self.points, self.points + [0, 0, 1.2 * size], self.points + [0, 2 * size, 0]])
-        look(server, room)
+        handles.look(server, room)
         self._panel()
 
     def _panel(self) -> None:

@@ -1,4 +1,4 @@
-"""What the viewer draws: clouds, meshes, boxes and paths as nodes of viser, metres, world frame."""
+"""What the viewer draws: clouds, meshes, boxes and paths as nodes of viser, metres, world frame; and its camera."""
 
 from typing import Any
 
@@ -7,10 +7,12 @@ from jaxtyping import Array, Float
 from matplotlib.colors import to_rgb
 
 from tdf_jax.viz import polygons3d
-from tdf_jax.viz.scene3d import MOST_TRIANGLES, bounds
+from tdf_jax.viz.scene3d import MOST_TRIANGLES, VIEW, bounds
 from tdf_jax.viz.style import COLOURS
 
 POINT, LINE = 0.0022, 0.0016  # metres: edge of a point, thickness of a line
+FIELD_OF_VIEW = 45.0  # degrees
+CELL = 0.05  # metres, cells of the floor
 MOST_POINTS = 20_000  # of a cloud; more are thinned, and first paint stays quick
 
 
@@ -157,3 +159,36 @@ def add_map(
 def place(node: Any, wxyz: Float[np.ndarray, "4"], xyz: Float[np.ndarray, "3"]) -> None:
     """Move a node to a pose of its frame."""
     node.wxyz, node.position = np.asarray(wxyz, float), np.asarray(xyz, float)
+
+
+def look(server: Any, contents: Float[np.ndarray, "points 3"]) -> None:
+    """Place the camera before what is shown, as in the pictures, and a floor of 5 cm cells under it.
+
+    Args:
+        server: the `viser.ViserServer`.
+        contents: points of all that is shown, (points, 3), metres, world frame.
+    """
+    azimuth, height = np.radians(VIEW["azim"]), np.radians(VIEW["elev"])
+    towards = np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
+    low, high = contents.min(axis=0), contents.max(axis=0)
+    middle, size = (low + high) / 2, high - low
+    distance = 0.58 * np.linalg.norm(size) / np.tan(np.radians(FIELD_OF_VIEW) / 2)
+    server.scene.set_up_direction("+z")
+    camera = server.initial_camera
+    camera.position, camera.look_at = middle + distance * towards, middle
+    camera.fov, camera.near = np.radians(FIELD_OF_VIEW), 0.005
+    cells = np.ceil((size[:2] + 4 * CELL) / CELL) * CELL
+    server.scene.add_grid(
+        "/floor",
+        width=cells[0],
+        height=cells[1],
+        plane="xy",
+        cell_size=CELL,
+        section_size=2 * CELL,
+        cell_color=(225, 225, 225),
+        section_color=(205, 205, 205),
+        position=(middle[0], middle[1], low[2] - CELL),
+    )
+    words = f"cells of {100 * CELL:g} cm"
+    near = (middle[0] + 0.25 * cells[0], middle[1] - 0.25 * cells[1], low[2] - CELL)
+    server.scene.add_label("/floor_name", words, position=near)

@@ -1,6 +1,5 @@
-"""A folder of results on the screen: what is shown, what the panel says, and what the mouse does."""
+"""An imitation on the screen: what is shown, what the panel says, and what the mouse does."""
 
-import threading
 import time
 from typing import Any
 
@@ -13,24 +12,22 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
 from tdf_jax.landscape.storage import Landscape
 from tdf_jax.viewer import handles, solving
+from tdf_jax.viewer.energies import show_landscape
+from tdf_jax.viewer.player import Player
 from tdf_jax.viewer.solving import Found, Problem
 from tdf_jax.viewer.worker import Worker
 from tdf_jax.viz.imitation_page import above
-from tdf_jax.viz.landscapes import LEVELS, SURFACES, isosurface
 from tdf_jax.viz.motion import motion_of
 from tdf_jax.viz.scene3d import VIEW
 from tdf_jax.viz.style import CLOUD, COLOURS, INK, TRUTH
 
 STEP = 0.1  # of the time slider, poses
 POSES_A_SECOND = 2.0
-RATE = 20.0  # frames a second
 BESIDE, OVER, HIDDEN = "beside", "over it", "hidden"
-FIELD_OF_VIEW = 45.0  # degrees
 BOX, SURFACE, PROBE = COLOURS(0.35), "#7aa6c2", "#f4845f"
 REACH = 0.006  # metres from the ray of a click within which a point is hit
 SHOWN_MODES = 12
 GRIP = 0.5  # length of the arrows at the object, in its diagonal
-CELL = 0.05  # metres, cells of the floor
 
 
 class Stage:
@@ -46,8 +43,6 @@ class Stage:
         self.server, self.problem = server, problem
         self.found = solving.chosen(problem, 0)
         self.worker = Worker(self._say)
-        self._lock = threading.RLock()
-        self._playing: threading.Event | None = None
         self._centroid = np.asarray(problem.points, float).mean(axis=0)
         self._draw()
         self._panel(landscape)
@@ -57,7 +52,7 @@ class Stage:
 
     def close(self) -> None:
         """Stop what runs beside the server."""
-        self._stop()
+        self.player.stop()
         self.worker.close()
 
     # What is drawn
@@ -164,7 +159,7 @@ class Stage:
         gap = 0.3 * self._size()
         self._beside = right * ((contents @ right).min() - (shown @ right).max() - gap)
         self._beside = self._beside + [0, 0, contents[:, 2].min() - shown[:, 2].min()]
-        look(self.server, np.concatenate([contents, shown + self._beside]))
+        handles.look(self.server, np.concatenate([contents, shown + self._beside]))
 
     def _add_surface(self) -> None:
         try:
@@ -198,10 +193,7 @@ class Stage:
         self._status = gui.add_markdown("Preparing the solver ...")
         with gui.add_folder("Time"):
             last = len(self.found.path) - 1
-            self._time = gui.add_slider("pose", 0.0, max(float(last), STEP), STEP, float(result.grasp))
-            self._play = gui.add_button("Play")
-        self._time.on_update(self._time_moved)
-        self._play.on_click(lambda _: self._stop() if self._playing else self._start())
+            self.player = Player(gui, "pose", last, STEP, result.grasp, POSES_A_SECOND, self._show_time)
         with gui.add_folder("Picks"):
             modes = self.problem.modes[:SHOWN_MODES]
             energies = self.problem.pick_energies[: len(modes)]
@@ -254,10 +246,10 @@ class Stage:
     def _drag_object(self, grip: Any) -> None:
         R = Rotation.from_quat(np.asarray(grip.wxyz), scalar_first=True).as_matrix()
         motion = np.concatenate([grip.wxyz, np.asarray(grip.position) - R @ self._centroid])
-        with self._lock:
-            self._stop()
+        with self.player.lock:
+            self.player.stop()
             # Later the object is held, and not at its handle.
-            self._time.value = float(self.problem.scene.result.grasp)
+            self.player.value = self.problem.scene.result.grasp
             handles.place(self._object, motion[:4], motion[4:])
         self.worker.ask("solve", lambda: self._solve(motion))
 
@@ -281,9 +273,9 @@ class Stage:
         self.worker.ask("goal", move)
 
     def _choose(self, number: int) -> None:
-        self._stop()
+        self.player.stop()
         self._grip.wxyz, self._grip.position = np.array([1.0, 0, 0, 0]), self._centroid
-        self._time.value = float(self.problem.scene.result.grasp)
+        self.player.value = self.problem.scene.result.grasp
         self.worker.ask("choose", lambda: self._show(solving.chosen(self.problem, number)))
 
     def _clicked(self, event: Any) -> None:
@@ -321,11 +313,11 @@ class Stage:
     # What changes
 
     def _show(self, found: Found, goal: bool = True) -> None:
-        with self._lock, self.server.atomic():
+        with self.player.lock, self.server.atomic():
             self.found = found
             self._path.points = handles.path_segments(found.path[:, 4:]).astype(np.float32)
             self._fit(len(found.path))
-            self._time.max = max(float(len(found.path) - 1), STEP)
+            self.player.extend(len(found.path) - 1)
             for node, pose in zip(self._boxes, found.path, strict=True):
                 handles.place(node, pose[:4], pose[4:])
             if goal:
@@ -335,8 +327,8 @@ class Stage:
 
     def _show_time(self) -> None:
         result, demonstration = self.problem.scene.result, self.problem.scene.demonstration
-        index = np.array([min(float(self._time.value), len(self.found.path) - 1.0)])
-        with self._lock, self.server.atomic():
+        index = np.array([min(self.player.value, len(self.found.path) - 1.0)])
+        with self.player.lock, self.server.atomic():
             motion = motion_of(self.found.path, result.grasp, result.release, index)
             self._put(self._box, motion.rotations[0], motion.translations[0])
             R = Rotation.from_quat(self.found.motion[:4], scalar_first=True).as_matrix()
@@ -350,123 +342,6 @@ class Stage:
 
     def _put(self, node: Any, R: np.ndarray, t: np.ndarray) -> None:
         handles.place(node, Rotation.from_matrix(R).as_quat(scalar_first=True), t)
-
-    def _time_moved(self, event: Any) -> None:
-        if event.client_id is not None:  # the user's hand, not the player
-            self._stop()
-        self._show_time()
-
-    def _start(self) -> None:
-        self._playing = stop = threading.Event()
-        self._play.label = "Pause"
-        last = len(self.found.path) - 1
-        if self._time.value >= last - STEP / 2:
-            self._time.value = 0.0
-
-        def run():
-            began, first = time.monotonic(), self._time.value
-            while not stop.wait(1 / RATE):
-                place = first + POSES_A_SECOND * (time.monotonic() - began)
-                with self._lock:
-                    if stop.is_set():
-                        break
-                    self._time.value = min(float(last), round(place / STEP) * STEP)
-                    if place >= last:
-                        self._stop()
-
-        threading.Thread(target=run, daemon=True).start()
-
-    def _stop(self) -> None:
-        with self._lock:
-            playing, self._playing = self._playing, None
-            if playing is not None:
-                playing.set()
-                self._play.label = "Play"
-
-
-def look(server: Any, contents: Float[np.ndarray, "points 3"]) -> None:
-    """Place the camera before what is shown, as in the pictures, and a floor of 5 cm cells under it.
-
-    Args:
-        server: the `viser.ViserServer`.
-        contents: points of all that is shown, (points, 3), metres, world frame.
-    """
-    azimuth, height = np.radians(VIEW["azim"]), np.radians(VIEW["elev"])
-    towards = np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
-    low, high = contents.min(axis=0), contents.max(axis=0)
-    middle, size = (low + high) / 2, high - low
-    distance = 0.58 * np.linalg.norm(size) / np.tan(np.radians(FIELD_OF_VIEW) / 2)
-    server.scene.set_up_direction("+z")
-    camera = server.initial_camera
-    camera.position, camera.look_at = middle + distance * towards, middle
-    camera.fov, camera.near = np.radians(FIELD_OF_VIEW), 0.005
-    cells = np.ceil((size[:2] + 4 * CELL) / CELL) * CELL
-    server.scene.add_grid(
-        "/floor",
-        width=cells[0],
-        height=cells[1],
-        plane="xy",
-        cell_size=CELL,
-        section_size=2 * CELL,
-        cell_color=(225, 225, 225),
-        section_color=(205, 205, 205),
-        position=(middle[0], middle[1], low[2] - CELL),
-    )
-    words = f"cells of {100 * CELL:g} cm"
-    near = (middle[0] + 0.25 * cells[0], middle[1] - 0.25 * cells[1], low[2] - CELL)
-    server.scene.add_label("/floor_name", words, position=near)
-
-
-def show_landscape(server: Any, landscape: Landscape) -> None:
-    """Add an energy landscape: a plane, or the slices and the surfaces of a volume, with its waypoints and minimisers.
-
-    Args:
-        server: the `viser.ViserServer`.
-        landscape: landscape of a grid with two or three axes, in one orientation or the best of several.
-    """
-    energy, points, gui = landscape.combined, landscape.grid.points, server.gui
-    if energy.ndim not in (2, 3) or energy.shape != landscape.grid.shape:
-        raise InputError(
-            f"tdf view: the landscape has energies {energy.shape}; expected a grid with two or three axes in one "
-            "orientation, or the best of several"
-        )
-    low, high = float(np.nanmin(energy)), float(np.nanmax(energy))
-    marks = [
-        handles.add_path(server, "/landscape/waypoints", landscape.waypoints, "#e9c46a"),
-        handles.add_cloud(server, "/landscape/minimisers", landscape.minimisers, TRUTH),
-    ]
-    marks[1].point_size = 0.008
-    nodes: dict[str, Any] = {}
-
-    def slice_at(number: int) -> None:
-        visible = nodes["slice"].visible if nodes else True
-        plane = handles.add_map(server, "/landscape/slice", points[..., number, :], energy[..., number], (low, high))
-        plane.visible = visible
-        nodes["slice"] = plane
-
-    with gui.add_folder("Landscape"):
-        gui.add_markdown(f"Energy from {low:.4f} (dark) to {high:.4f} (light); red: minimum of each waypoint.")
-        if energy.ndim == 2:
-            nodes["slice"] = handles.add_map(server, "/landscape/slice", points, energy, (low, high))
-        else:
-            count = energy.shape[2]
-            chosen = gui.add_slider("slice", 0, count - 1, 1, count // 2)
-            chosen.on_update(lambda event: slice_at(int(event.target.value)))
-            slice_at(count // 2)
-            for share, colour in zip(LEVELS, SURFACES):
-                try:
-                    triangles = isosurface(landscape, share)
-                except InputError:  # libigl is an extra
-                    break
-                node = handles.add_triangles(server, f"/landscape/surface{share}", triangles, colour, 0.35)
-                _switch(gui, f"surface of the least {100 * share:.0f} %", node)
-        shown = gui.add_checkbox("plane", True)
-        shown.on_update(lambda event: setattr(nodes["slice"], "visible", event.target.value))
-
-
-def _switch(gui: Any, name: str, node: Any) -> None:
-    box = gui.add_checkbox(name, True)
-    box.on_update(lambda event: setattr(node, "visible", event.target.value))
 
 
 def _words(found: Found) -> str:

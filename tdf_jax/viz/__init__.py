@@ -7,6 +7,7 @@ Modules:
     contact_sheet: many objects side by side
     evaluation: pictures of the benchmark
     film: frames of a film of an imitation
+    film_file: pictures and films as files
     html: page of an energy landscape
     imitation: an imitation and its losses
     imitation_page: page of an imitation, which plays

@@ -53,6 +53,11 @@ function moved(points, motion) {
   return [axis(0), axis(1), axis(2)];
 }
 
+function placed(one, frame) {
+  const parts = (one.parts || [one]).map((part) => moved(part.points, part.motions[frame]));
+  return [0, 1, 2].map((axis) => parts.flatMap((part) => part[axis]));
+}
+
 async function open() {
   const script = document.createElement("script");
   script.textContent = await unpacked("plotly");
@@ -76,7 +81,7 @@ function animated(figure, content) {
     while (wanted !== null) {
       const now = wanted;
       wanted = null;
-      const shown = content.moving.map((one) => moved(one.points, one.motions[now]));
+      const shown = content.moving.map((one) => placed(one, now));
       await Plotly.restyle(figure, {x: shown.map((p) => p[0]), y: shown.map((p) => p[1]), z: shown.map((p) => p[2])},
                            traces);
       document.getElementById("pose").textContent = content.labels[now];
@@ -152,7 +157,8 @@ def write_page(
         lead: lines under the title, plain text.
         motion: what moves, in types of JSON: "labels", one for each frame; "rate", frames a second; and "moving": for
             each moving trace its number "trace", its "points", (3, points), in the frame that moves, and its "motions",
-            a rotation (3, 3) and a translation (3,) for each frame. None if nothing moves.
+            a rotation (3, 3) and a translation (3,) for each frame; or instead of these two "parts", each with both,
+            whose points are those of the trace one after the other. None if nothing moves.
 
     Raises:
         InputError: the page would have more than `LARGEST` bytes, or the file cannot be written.

@@ -5,12 +5,13 @@ import threading
 import jax
 import numpy as np
 import pytest
-from conftest import CARRY, random_cloud
+from conftest import CARRY, random_cloud, short_playback
 
 import tdf_jax as tdf
 from tdf_jax.cli.main import main
 from tdf_jax.geometry.grid import plane_grid
 from tdf_jax.landscape.storage import Landscape
+from tdf_jax.sim.playback import FOLDER, save_playback
 from tdf_jax.solvers.imitation_scene import SCENE, weights_of
 
 pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
@@ -43,15 +44,28 @@ def refusal(capsys, *words):
     return capsys.readouterr().err
 
 
-@pytest.mark.parametrize("what", ["imitation", "both", "landscape"])
-def test_a_folder_is_shown_until_ctrl_c(folder, landscape, what, monkeypatch, capsys):
+@pytest.fixture
+def simulated(tmp_path):
+    (tmp_path / "benchmark" / "runs").mkdir(parents=True)
+    save_playback("test", tmp_path / "benchmark" / "runs" / FOLDER, "it", short_playback(number=4))
+    return tmp_path / "benchmark" / "runs"
+
+
+@pytest.mark.parametrize("what", ["imitation", "both", "landscape", "episodes", "benchmark"])
+def test_a_folder_is_shown_until_ctrl_c(folder, landscape, simulated, what, monkeypatch, capsys):
     def interrupted(self, timeout=None):
         raise KeyboardInterrupt
 
     opened = []
     monkeypatch.setattr("webbrowser.open", opened.append)
     monkeypatch.setattr("tdf_jax.cli.view.Waiting.wait", interrupted)
-    words = {"imitation": [folder], "both": [folder, "--landscape", landscape], "landscape": [landscape]}[what]
+    words = {
+        "imitation": [folder],
+        "both": [folder, "--landscape", landscape],
+        "landscape": [landscape],
+        "episodes": [simulated, "--episode", 4],
+        "benchmark": [simulated.parent],
+    }[what]
     with pytest.raises(SystemExit) as stop:
         main(["view", *map(str, words), "--port", "0"])
     assert stop.value.code == 130
@@ -78,6 +92,12 @@ def test_an_object_is_shown_to_demonstrate_on(tmp_path, monkeypatch, capsys):
     assert "drop --scale" in refusal(capsys, tmp_path, "--scale", "0.01")
 
 
+def test_options_of_other_folders_are_refused(folder, landscape, simulated, capsys):
+    assert "there is no episode 7 in" in refusal(capsys, simulated, "--episode", 7)
+    assert "drop --landscape and --weights" in refusal(capsys, simulated, "--landscape", landscape)
+    assert "is no folder of `tdf simulate`; expected one for --episode" in refusal(capsys, folder, "--episode", 0)
+
+
 def test_what_is_no_result_is_refused(folder, landscape, weights, tmp_path, capsys):
     assert "there is no folder" in refusal(capsys, tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
@@ -85,7 +105,7 @@ def test_what_is_no_result_is_refused(folder, landscape, weights, tmp_path, caps
     (tmp_path / "simulation").mkdir()
     (tmp_path / "simulation" / "result.json").write_text("{}")
     said = refusal(capsys, tmp_path / "simulation")
-    assert "tdf view: " in said and "expected a folder of `tdf imitate` or `tdf landscape`" in said
+    assert "tdf view: " in said and "expected a folder of `tdf imitate`, `tdf landscape` or `tdf simulate`" in said
     assert "load_imitation" not in said
     assert "there is no file" in refusal(capsys, folder, "--landscape", tmp_path / "empty")
     assert "is a landscape, and there is --landscape" in refusal(capsys, landscape, "--landscape", landscape)

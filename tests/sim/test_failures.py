@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import lifted
+from conftest import lifted, short_playback
 from PIL import Image
 
 from tdf_jax._internal.errors import InputError
@@ -69,7 +69,9 @@ def test_a_picture_has_two_views_of_the_failure(robot, drawn, renderer, monkeypa
     if cause == "unreachable":
         release[0, 3] += 3
     path = lifted(pick_beside(episode) if cause == "slipped" else episode.pick, release, 0.2)
-    found = Found(path[None], np.array([episode.grip.opening]), path[-1] @ np.linalg.inv(path[0]), "", 0.0)
+    found = Found(
+        path[None], np.array([episode.grip.opening]), path[-1] @ np.linalg.inv(path[0]), "", 0.0, np.zeros((0, 3))
+    )
     monkeypatch.setattr(failures, "found_in", lambda settings, number: (episode, robot, found))
     settings = Settings(SHELF._replace(mode=mode), "bowl", None, 0, tmp_path)
     pixels = picture_one(settings, run(7, cause, settings.condition, grasp))
@@ -115,3 +117,23 @@ def test_pictures_and_their_sheet_are_written(monkeypatch, tmp_path):
         "bowl_on_shelf-execute-known-upright-5-not_settled.png",
         "failures.png",
     ]
+
+
+def test_a_page_of_each_failure_stands_beside_its_picture(monkeypatch, tmp_path, capsys):
+    """Pages need no renderer, and what was not kept ends no command."""
+    from tdf_jax.cli.episodes import draw_failures
+    from tdf_jax.cli.pictures import PictureError
+    from tdf_jax.sim.campaign import about_episode
+    from tdf_jax.sim.playback import FOLDER, save_playback
+
+    pytest.importorskip("plotly")
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    settings = named(folder=tmp_path)
+    rows = [(settings, [run(3, "fell"), run(5, "not settled")])]
+    save_playback("test", tmp_path / FOLDER, "it", short_playback(about_episode(settings, 3)))
+    with pytest.raises(PictureError, match=r"5-not_settled.html is missing .*episode 5 was run before episodes were"):
+        draw_failures("tdf simulate", rows, tmp_path / "failures", page=True)
+    assert [one.name for one in (tmp_path / "failures").iterdir()] == [
+        "bowl_on_shelf-execute-known-upright-3-fell.html"
+    ]
+    assert "no pictures of failures" in capsys.readouterr().err

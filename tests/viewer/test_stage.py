@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 import tdf_jax as tdf
 from tdf_jax.geometry.grid import plane_grid, volume_grid
 from tdf_jax.landscape.storage import Landscape
-from tdf_jax.viewer import solving, stage
+from tdf_jax.viewer import energies, solving, stage
 from tdf_jax.viewer.local_server import address, serving
 
 pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
@@ -48,7 +48,7 @@ def test_what_is_placed_on_a_target_is_dragged_as_well(placed_scene, small_model
             assert "Solved in" in shown._status.content
             drag(shown, shown._goal, shown.found.goal[4:] + [0.1, 0, 0])
             assert "The path follows" in shown._status.content
-            assert count == len(shown.found.path) == len(shown._boxes) == shown._time.max + 1
+            assert count == len(shown.found.path) == len(shown._boxes) == shown.player.slider.max + 1
             np.testing.assert_allclose(shown._boxes[-1].position, shown.found.path[-1, 4:], atol=1e-6)
         finally:
             shown.close()
@@ -98,7 +98,7 @@ def test_a_goal_that_is_dragged_takes_the_path_along(shown):
 
 
 def test_the_object_is_carried_between_grasp_and_release(shown):
-    shown._time.value = float(len(shown.found.path) - 1)
+    shown.player.value = len(shown.found.path) - 1
     shown._show_time()
     motion = np.asarray(shown.problem.scene.result.object_motion)
     np.testing.assert_allclose(shown._object.position, motion[4:], atol=1e-5)
@@ -107,15 +107,15 @@ def test_the_object_is_carried_between_grasp_and_release(shown):
 
 
 def test_an_object_that_is_dragged_while_it_is_held_stays_at_its_handle(shown):
-    shown._time.value = float(len(shown.found.path) - 1)
+    shown.player.value = len(shown.found.path) - 1
     drag(shown, shown._grip, shown._centroid + [0, 0, 0.05])
-    assert shown._time.value == shown.problem.scene.result.grasp
+    assert shown.player.value == shown.problem.scene.result.grasp
     np.testing.assert_allclose(shown._object.position, [0, 0, 0.05], atol=1e-6)
 
 
 def test_the_point_that_is_clicked_is_that_of_the_held_object(shown, problem):
     drag(shown, shown._grip, shown._centroid + [0, 0, 0.05])
-    shown._time.value = float(len(shown.found.path) - 1)
+    shown.player.value = len(shown.found.path) - 1
     shown._show_time()
     R = Rotation.from_quat(shown._object.wxyz, scalar_first=True)
     point = R.apply(problem.points[7]) + shown._object.position
@@ -131,21 +131,21 @@ def test_the_point_that_is_clicked_is_that_of_the_held_object(shown, problem):
 
 
 def test_a_hand_on_the_slider_stops_the_player(shown):
-    shown._start()
-    shown._time_moved(type("Event", (), {"client_id": None})())
-    assert shown._playing
-    shown._time_moved(type("Event", (), {"client_id": 0})())
-    assert not shown._playing and shown._play.label == "Play"
+    shown.player.start()
+    shown.player.moved(type("Event", (), {"client_id": None})())
+    assert shown.player.playing
+    shown.player.moved(type("Event", (), {"client_id": 0})())
+    assert not shown.player.playing and shown.player.button.label == "Play"
 
 
-def test_playing_ends_at_the_last_pose(shown, monkeypatch):
-    monkeypatch.setattr(stage, "POSES_A_SECOND", 30.0)
-    shown._start()
-    assert shown._play.label == "Pause"
+def test_playing_ends_at_the_last_pose(shown):
+    shown.player.speed = 30.0
+    shown.player.start()
+    assert shown.player.button.label == "Pause"
     until = time.monotonic() + SECONDS
-    while shown._playing and time.monotonic() < until:
+    while shown.player.playing and time.monotonic() < until:
         time.sleep(0.01)
-    assert shown._play.label == "Play" and shown._time.value == len(shown.found.path) - 1
+    assert shown.player.button.label == "Play" and shown.player.value == len(shown.found.path) - 1
 
 
 def test_an_energy_is_shown_at_the_point_that_is_clicked(shown, problem):
@@ -178,7 +178,7 @@ def test_another_pick_is_shown_and_the_result_comes_back(shown, problem):
 @pytest.mark.parametrize("grid", [plane_grid(0.2, 4), volume_grid(0.2, 4)], ids=["plane", "volume"])
 def test_a_landscape_is_shown_in_slices(grid):
     with serving("test", 0) as server:
-        stage.show_landscape(server, bowl(grid))
+        energies.show_landscape(server, bowl(grid))
         names = set(server.scene._handle_from_node_name)
         assert {"/landscape/slice", "/landscape/waypoints", "/landscape/minimisers"} <= names
         inputs = server.gui._gui_input_handle_from_uuid.values()
@@ -191,7 +191,7 @@ def test_a_landscape_is_shown_in_slices(grid):
         object.__setattr__(each, "values", each.values[:, None])
         object.__setattr__(each, "turned", None)
         with pytest.raises(tdf.InputError, match="expected a grid with two or three axes in one orientation"):
-            stage.show_landscape(server, each)
+            energies.show_landscape(server, each)
 
 
 @pytest.mark.slow

@@ -1,0 +1,63 @@
+"""An energy landscape on the screen."""
+
+from typing import Any
+
+import numpy as np
+
+from tdf_jax._internal.errors import InputError
+from tdf_jax.landscape.storage import Landscape
+from tdf_jax.viewer import handles
+from tdf_jax.viz.landscapes import LEVELS, SURFACES, isosurface
+from tdf_jax.viz.style import TRUTH
+
+
+def show_landscape(server: Any, landscape: Landscape) -> None:
+    """Add an energy landscape: a plane, or the slices and the surfaces of a volume, with its waypoints and minimisers.
+
+    Args:
+        server: the `viser.ViserServer`.
+        landscape: landscape of a grid with two or three axes, in one orientation or the best of several.
+    """
+    energy, points, gui = landscape.combined, landscape.grid.points, server.gui
+    if energy.ndim not in (2, 3) or energy.shape != landscape.grid.shape:
+        raise InputError(
+            f"tdf view: the landscape has energies {energy.shape}; expected a grid with two or three axes in one "
+            "orientation, or the best of several"
+        )
+    low, high = float(np.nanmin(energy)), float(np.nanmax(energy))
+    marks = [
+        handles.add_path(server, "/landscape/waypoints", landscape.waypoints, "#e9c46a"),
+        handles.add_cloud(server, "/landscape/minimisers", landscape.minimisers, TRUTH),
+    ]
+    marks[1].point_size = 0.008
+    nodes: dict[str, Any] = {}
+
+    def slice_at(number: int) -> None:
+        visible = nodes["slice"].visible if nodes else True
+        plane = handles.add_map(server, "/landscape/slice", points[..., number, :], energy[..., number], (low, high))
+        plane.visible = visible
+        nodes["slice"] = plane
+
+    with gui.add_folder("Landscape"):
+        gui.add_markdown(f"Energy from {low:.4f} (dark) to {high:.4f} (light); red: minimum of each waypoint.")
+        if energy.ndim == 2:
+            nodes["slice"] = handles.add_map(server, "/landscape/slice", points, energy, (low, high))
+        else:
+            count = energy.shape[2]
+            chosen = gui.add_slider("slice", 0, count - 1, 1, count // 2)
+            chosen.on_update(lambda event: slice_at(int(event.target.value)))
+            slice_at(count // 2)
+            for share, colour in zip(LEVELS, SURFACES):
+                try:
+                    triangles = isosurface(landscape, share)
+                except InputError:  # libigl is an extra
+                    break
+                node = handles.add_triangles(server, f"/landscape/surface{share}", triangles, colour, 0.35)
+                _switch(gui, f"surface of the least {100 * share:.0f} %", node)
+        shown = gui.add_checkbox("plane", True)
+        shown.on_update(lambda event: setattr(nodes["slice"], "visible", event.target.value))
+
+
+def _switch(gui: Any, name: str, node: Any) -> None:
+    box = gui.add_checkbox(name, True)
+    box.on_update(lambda event: setattr(node, "visible", event.target.value))
