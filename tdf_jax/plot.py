@@ -1,7 +1,7 @@
 """Pictures of imitations, landscapes and fields as figures of matplotlib: `tdf.plot.imitation(...)`.
 
-Every function returns the figure. With `ax=` it draws on axes of yours, such as a panel of a larger figure, and returns
-their figure. Lengths are drawn in centimetres, energies have no unit. `figure.savefig(file)` writes it.
+Every function but `page` returns the figure. With `ax=` it draws on axes of yours, such as a panel of a larger figure,
+and returns their figure. Lengths are drawn in centimetres, energies have no unit. `figure.savefig(file)` writes it.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,7 @@ from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.landscape.storage import Landscape
 from tdf_jax.networks.field import DescriptorField
 from tdf_jax.networks.surface import surface_triangles
+from tdf_jax.solvers.imitation_scene import ImitationScene
 from tdf_jax.solvers.result import Result
 from tdf_jax.uncertainty.modes import cluster_poses
 
@@ -25,7 +26,9 @@ if TYPE_CHECKING:
     import trimesh
     from matplotlib.figure import Figure
 
-__all__ = ["candidates", "imitation", "landscape", "losses", "reconstruction"]
+    from tdf_jax.viz.page import Page
+
+__all__ = ["candidates", "imitation", "landscape", "losses", "page", "reconstruction"]
 
 
 @host
@@ -37,6 +40,7 @@ def imitation(
     target_points: Float[Array | np.ndarray, "target_points 3"] | None = None,
     expected: Trajectory | None = None,
     meshes: "tuple[trimesh.Trimesh | None, trimesh.Trimesh | None]" = (None, None),
+    candidate: int | None = None,
     title: str = "",
     ax: Any | None = None,
 ) -> "Figure":
@@ -50,6 +54,7 @@ def imitation(
             has not moved.
         expected: ground truth, T_world_query, drawn dashed.
         meshes: meshes of the demonstrated and of the new object, metres, world frame; drawn instead of the points.
+        candidate: index of the candidate that is drawn; by default the best.
         title: title above the picture.
         ax: three-dimensional axes, on which the imitation alone is drawn.
 
@@ -57,17 +62,21 @@ def imitation(
         The figure.
 
     Raises:
-        InputError: no candidate is finite, the result is a batch, or the axes are not three-dimensional.
+        InputError: no candidate is finite, the result is a batch, there is no such candidate, or the axes are not
+            three-dimensional.
     """
     cloud = np.asarray(checks.points("plot.imitation()", points))
     trajectory = _one("plot.imitation()", result).trajectory
+    if candidate is not None:
+        checks.count("plot.imitation()", "candidate", candidate, 0, len(result.energies) - 1)
+        trajectory = Trajectory(jnp.asarray(np.asarray(result.trajectories)[candidate]))
     if ax is None:
         from tdf_jax.viz.imitation import imitation_figure
         from tdf_jax.viz.relations import relation_figure
 
         if demonstration.target is not None:
             placed = None if target_points is None else np.asarray(checks.points("plot.imitation()", target_points))
-            return relation_figure(demonstration, cloud, result, placed, title=title)
+            return relation_figure(demonstration, cloud, result, placed, candidate=candidate, title=title)
         return imitation_figure(demonstration, cloud, trajectory, expected, meshes, title)
     from tdf_jax.viz.single import axes3d, styled, trajectory_panel
 
@@ -215,6 +224,47 @@ def reconstruction(
         surface_panel(axes, triangles, cloud)
         axes.set_title(title)
     return figure
+
+
+@host
+def page(
+    what: ImitationScene | Landscape,
+    *,
+    points: Float[Array | np.ndarray, "points 3"] | None = None,
+    mesh: "trimesh.Trimesh | None" = None,
+    title: str = "",
+) -> "Page":
+    """Draw an imitation or a landscape to turn and to play, in a cell of a notebook or as an .html file.
+
+    The page needs neither a server nor a network, and stays in the notebook when it is saved; it has 2 to 5 MB.
+
+    Args:
+        what: an imitation with all that its picture needs, see `ImitationScene` and `load_imitation`; or a landscape in
+            one orientation or the best of several.
+        points: of a landscape, cloud of the object, (points, 3), metres, world frame; not drawn by default.
+        mesh: of a landscape, mesh of the object, metres, world frame, drawn instead of the points.
+        title: title above the picture.
+
+    Returns:
+        The page. The last expression of a cell shows itself; `save("imitation.html")` writes it.
+
+    Raises:
+        InputError: plotly (or, for a volume, libigl) is not installed, the page would be too large to pass on, no
+            candidate is finite, the landscape cannot be drawn, or points or a mesh are given for an imitation.
+    """
+    if isinstance(what, ImitationScene):
+        if points is not None or mesh is not None:
+            raise InputError("plot.page(): points or a mesh are given; an ImitationScene has its own: drop them")
+        from tdf_jax.viz.imitation_page import imitation_page
+
+        return imitation_page("plot.page()", what, title)
+    if not isinstance(what, Landscape):
+        raise InputError(f"plot.page(): got a {type(what).__name__}; expected an ImitationScene or a Landscape")
+    cloud = np.zeros((0, 3)) if points is None else np.asarray(checks.points("plot.page()", points))
+    from tdf_jax.viz.html import landscape_page
+    from tdf_jax.viz.landscapes import Marks
+
+    return landscape_page("plot.page()", what, Marks(cloud, mesh), title or "Energy landscape")
 
 
 def _one(function: str, result: Result) -> Result:

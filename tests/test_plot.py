@@ -1,6 +1,7 @@
 """`tdf.plot` and how objects show themselves in a notebook."""
 
 import base64
+import html
 import io
 import re
 
@@ -8,7 +9,7 @@ import jax
 import matplotlib
 import numpy as np
 import pytest
-from conftest import CARRY, colours_of, random_cloud
+from conftest import CARRY, colours_of, page_content, random_cloud
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -55,7 +56,38 @@ CALLS = {
 
 
 def test_every_function_has_a_call():
-    assert sorted(CALLS) == tdf.plot.__all__
+    assert sorted([*CALLS, "page"]) == tdf.plot.__all__
+
+
+def test_another_candidate_is_drawn(demonstration, result):
+    """Its path is the line of the new object."""
+    worst = int(np.argmax(result.energies))
+    mine = axes(3)
+    tdf.plot.imitation(demonstration, CLOUD, result, candidate=worst, ax=mine)
+    (path,) = [line for line in mine.lines if line.get_label() == "trajectory of the query frame"]
+    np.testing.assert_allclose(np.array(path.get_data_3d()).T, 100 * result.trajectories[worst][:, 4:], rtol=1e-5)
+    with pytest.raises(
+        InputError, match=f"candidate is 3; expected a whole number from 0 to {len(result.energies) - 1}"
+    ):
+        tdf.plot.imitation(demonstration, CLOUD, result, candidate=3)
+
+
+def test_a_page_shows_itself_in_a_cell_and_is_saved(demonstration, result, tmp_path):
+    """The cell holds the same page as the file, as a page within the page."""
+    pytest.importorskip("plotly")
+    scene = tdf.ImitationScene(demonstration, CLOUD, result)
+    page = tdf.plot.page(scene, title="Two <mugs>")
+    page.save(tmp_path / "it.html")
+    text = (tmp_path / "it.html").read_text()
+    cell = page._repr_html_()
+    assert cell.startswith("<iframe srcdoc=") and html.unescape(cell.split('"')[1]) == text
+    assert "Two &lt;mugs&gt;" in text and len(repr(page)) < 100
+    flat = tdf.plot.page(bowl(plane_grid(0.2, 5)), points=CLOUD)
+    assert {one["type"] for one in page_content(flat.text)["data"]} >= {"surface", "scatter3d"}
+    with pytest.raises(InputError, match="an ImitationScene has its own: drop them"):
+        tdf.plot.page(scene, points=CLOUD)
+    with pytest.raises(InputError, match=r"plot.page\(\): got a Result; expected an ImitationScene or a Landscape"):
+        tdf.plot.page(result)
 
 
 @pytest.mark.parametrize("name", CALLS)

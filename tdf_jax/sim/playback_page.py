@@ -10,7 +10,7 @@ from jaxtyping import Float
 from tdf_jax.sim.playback import RATE, Playback
 from tdf_jax.sim.solids import Solid
 from tdf_jax.sim.workcell import OBJECT, TABLE_NAME, TARGET
-from tdf_jax.viz.page import camera, listed, pages, scene_axes, write_page
+from tdf_jax.viz.page import Page, camera, listed, page_of, pages, scene_axes
 from tdf_jax.viz.scene3d import VIEW
 from tdf_jax.viz.style import CENTIMETRES, COLOURS, INK
 
@@ -30,7 +30,19 @@ def save_playback_page(path: str | os.PathLike, playback: Playback) -> None:
     Raises:
         InputError: plotly is not installed, the page would be too large to pass on, or the file cannot be written.
     """
-    function = "save_playback_page()"
+    episode_page("save_playback_page()", playback).save(path)
+
+
+def episode_page(function: str, playback: Playback) -> Page:
+    """The page of an episode; see `save_playback_page`.
+
+    Args:
+        function: name that error messages begin with.
+        playback: the episode.
+
+    Raises:
+        InputError: plotly is not installed, or the page would be too large to pass on.
+    """
     plotly = pages(function)
     every = max(EVERY, -(-len(playback.times) // MOST_FRAMES))
     frames = np.unique([*range(0, len(playback.times), every), len(playback.times) - 1])
@@ -74,7 +86,7 @@ def save_playback_page(path: str | os.PathLike, playback: Playback) -> None:
         "rate": RATE / every,
         "moving": moving,
     }
-    write_page(function, path, figure, playback.title, _lead(playback), motion)
+    return page_of(function, figure, playback.title, _lead(playback), motion)
 
 
 def _groups(solids: tuple[Solid, ...]) -> dict[str, list[Solid]]:

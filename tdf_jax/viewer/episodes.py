@@ -1,6 +1,5 @@
 """A folder of simulated episodes on the screen: the robot, the object and the target, as they moved."""
 
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +7,7 @@ import numpy as np
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.sim.playback import RATE, kept_episodes, load_playback
-from tdf_jax.sim.playback_page import save_playback_page
+from tdf_jax.sim.playback_page import episode_page
 from tdf_jax.sim.workcell import OBJECT, TABLE_NAME, TARGET
 from tdf_jax.viewer import handles
 from tdf_jax.viewer.player import Player
@@ -202,10 +201,9 @@ class EpisodeStage:
     def _save(self, event: Any) -> None:
         """Send the page of the episode to the browser that asks for it."""
         name = f"{self._episodes[self._names(ALL).index(self._choice.value)][0].stem}.html"
-        with tempfile.TemporaryDirectory() as folder:
-            try:
-                save_playback_page(Path(folder) / name, self.playback)
-            except InputError as error:  # plotly is an extra
-                self._phase.content = str(error)
-                return
-            event.client.send_file_download(name, (Path(folder) / name).read_bytes())
+        try:
+            page = episode_page("tdf view", self.playback)
+        except InputError as error:  # plotly is an extra
+            self._phase.content = str(error)
+            return
+        event.client.send_file_download(name, page.text.encode())

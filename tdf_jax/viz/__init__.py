@@ -20,6 +20,7 @@ Modules:
     reconstruction: surfaces and transfers
     relations: an object placed on a target
     scene3d: an object with a trajectory
+    sides: demonstration and imitation of a moving picture
     single: pictures on given axes, for `tdf.plot`
     style: colours, sizes, saving
     training: curves of a training run

@@ -19,7 +19,7 @@ from tdf_jax.viz.landscapes import (
     isosurface,
     path_lines,
 )
-from tdf_jax.viz.page import camera, pages, scene_axes, write_page
+from tdf_jax.viz.page import Page, camera, page_of, pages, scene_axes
 from tdf_jax.viz.style import CENTIMETRES, CLOUD, INK
 
 
@@ -38,9 +38,25 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
         InputError: the grid has one axis, the landscape keeps every rotation, plotly (or, for a volume, libigl) is not
             installed, the page would be too large to pass on, or the file cannot be written.
     """
-    plotly = pages("save_page()")
+    landscape_page("save_page()", landscape, marks, title).save(path)
+
+
+def landscape_page(function: str, landscape: Landscape, marks: Marks, title: str = "") -> Page:
+    """The page of a landscape; see `save_page`.
+
+    Args:
+        function: name that error messages begin with.
+        landscape: landscape of a grid with two or three axes, in one orientation or the best of several.
+        marks: marks on the landscape.
+        title: title of the page.
+
+    Raises:
+        InputError: the grid has one axis, the landscape keeps every rotation, plotly (or, for a volume, libigl) is not
+            installed, or the page would be too large to pass on.
+    """
+    plotly = pages(function)
     grid = landscape.grid
-    check_landscape("save_page", landscape, axes=len(grid.shape) if len(grid.shape) > 1 else 2)
+    check_landscape(function.removesuffix("()"), landscape, axes=len(grid.shape) if len(grid.shape) > 1 else 2)
     energy, points = landscape.combined, CENTIMETRES * grid.points
     scale = {"colorscale": "Viridis", "colorbar": {"title": "energy"}}
     if energy.ndim == 2:
@@ -90,4 +106,4 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
     legend = {"x": 0, "y": 1, "bgcolor": "rgba(255,255,255,0.6)"}
     font = {"color": INK, "size": 13}
     figure.update_layout(scene=scene, legend=legend, font=font, margin={"l": 0, "r": 0, "b": 0, "t": 0})
-    write_page("save_page()", path, figure, title)
+    return page_of(function, figure, title)

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory
-from tdf_jax.viz.scene3d import View, bounds, content, draw, frame, triangles_of, waypoint_bar
+from tdf_jax.viz.scene3d import MARGIN, View, bounds, content, draw, frame, triangles_of, waypoint_bar
 from tdf_jax.viz.single import losses_panel
 from tdf_jax.viz.style import STYLE, add_axes3d, blank_figure, legend_of
 
@@ -45,7 +45,7 @@ def imitation_figure(
         "test": View(np.asarray(points), triangles[1], trajectory, expected),
     }
     contents = [content(view, box) for view in views.values()]
-    size = np.max([np.ptp(one, axis=0) for one in contents], axis=0) * 1.06
+    size = np.max([np.ptp(one, axis=0) for one in contents], axis=0) * MARGIN
     with matplotlib.rc_context(STYLE):
         figure = blank_figure(7.2, 4.5)
         legend = {}

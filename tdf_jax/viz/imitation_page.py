@@ -2,7 +2,7 @@
 
 import math
 import os
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 import matplotlib.colors
@@ -12,17 +12,14 @@ from jaxtyping import Float
 from tdf_jax.solvers.imitation_scene import ImitationScene
 from tdf_jax.uncertainty.modes import Mode, cluster_poses
 from tdf_jax.viz import polygons3d
-from tdf_jax.viz.motion import Motion, motion_of
-from tdf_jax.viz.page import camera, listed, pages, scene_axes, write_page
+from tdf_jax.viz.motion import motion_of
+from tdf_jax.viz.page import Page, camera, listed, page_of, pages, scene_axes
 from tdf_jax.viz.scene3d import MOST_TRIANGLES, VIEW, bounds, thinned
+from tdf_jax.viz.sides import Side, sides_of, sizes_of
 from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, TRUTH
 
-if TYPE_CHECKING:
-    import trimesh
-
 RATE = 12  # frames a second
-MARGIN = 1.06  # length of the axes, in that of their contents
-DISTANCE = 2.25  # of the camera, in the size of the scene
+DISTANCE = 2.6  # of the camera, in the size of the scene
 PICK, OTHERS = 0.35, (0.6, 0.95)  # places in the colour map: the pick, and the other distinct picks by rising energy
 SHOWN_MODES = 4  # distinct picks besides the best
 
@@ -41,28 +38,26 @@ def save_imitation_page(path: str | os.PathLike, scene: ImitationScene, title: s
         InputError: plotly is not installed, the page would be too large to pass on, no candidate is finite, or the
             file cannot be written.
     """
-    plotly = pages("save_imitation_page()")
+    imitation_page("save_imitation_page()", scene, title).save(path)
+
+
+def imitation_page(function: str, scene: ImitationScene, title: str = "") -> Page:
+    """The page of an imitation; see `save_imitation_page`.
+
+    Args:
+        function: name that error messages begin with.
+        scene: the imitation.
+        title: title of the page.
+
+    Raises:
+        InputError: plotly is not installed, the page would be too large to pass on, or no candidate is finite.
+    """
+    plotly = pages(function)
     demonstration, result = scene.demonstration, scene.result
     box = bounds(np.asarray(demonstration.query))
-    shown = np.asarray(demonstration.trajectory.wxyz_xyz)
-    found = np.asarray(result.trajectory.wxyz_xyz)
-    index = np.linspace(0, 1, 6 * (max(len(shown), len(found)) - 1) + 1)
-    panels = {
-        "scene": _Panel(
-            motion_of(shown, demonstration.grasp, demonstration.release, index * (len(shown) - 1)),
-            np.asarray(demonstration.points),
-            scene.meshes[0],
-            None if demonstration.target is None else np.asarray(demonstration.target.points),
-            shown,
-        ),
-        "scene2": _Panel(
-            motion_of(found, result.grasp, result.release, index * (len(found) - 1)),
-            np.asarray(scene.points),
-            scene.meshes[1],
-            _target_points(scene),
-            found,
-        ),
-    }
+    poses = len(result.trajectory.wxyz_xyz)
+    index = np.linspace(0, 1, 6 * (max(demonstration.trajectory.num_poses, poses) - 1) + 1)
+    panels = dict(zip(("scene", "scene2"), sides_of(scene, index)))
     drawn: list[Any] = []
     moving: list[dict] = []
     for name, panel in panels.items():
@@ -76,19 +71,16 @@ def save_imitation_page(path: str | os.PathLike, scene: ImitationScene, title: s
         words = f"pick {number}: energy {mode.energy:.4f}, {above(mode, modes[0])}"
         look = {"visible": "legendonly", "line": {"color": matplotlib.colors.to_hex(COLOURS(share)), "width": 4}}
         drawn.append(_line(plotly, corners, "scene2", words, **look))
-    last = len(found) - 1
+    last = poses - 1
     motion = {
         "labels": [f"pose {last * share:.1f} of {last}, {_phase(last * share, result, last)}" for share in index],
         "rate": RATE,
         "moving": moving,
     }
     figure = plotly.Figure(drawn)
-    # Ranges of all frames: otherwise the axes would move while it plays. Both sides have one scale, but for ways of a
-    # metre to a target, of which each is drawn as large as possible.
+    # Ranges of all frames: otherwise the axes would move while it plays.
     contents = [CENTIMETRES * panel.content(box) for panel in panels.values()]
-    sizes = [MARGIN * np.ptp(content, axis=0) for content in contents]
-    if demonstration.target is None:
-        sizes = [np.max(sizes, axis=0)] * 2
+    sizes = sizes_of(scene, contents)
     layout: dict[str, Any] = {}
     for column, (name, content, size) in enumerate(zip(panels, contents, sizes)):
         middle = (content.min(axis=0) + content.max(axis=0)) / 2
@@ -96,7 +88,7 @@ def save_imitation_page(path: str | os.PathLike, scene: ImitationScene, title: s
         layout[name] = scene_axes(middle - size / 2, middle + size / 2) | place
     titles = [
         {"text": text, "x": 0.245 + 0.5 * column, "y": 1.0, "xref": "paper", "yref": "paper", "showarrow": False}
-        for column, text in enumerate(("demonstration", "imitation"))
+        for column, text in enumerate(panel.name for panel in panels.values())
     ]
     legend = {"orientation": "h", "x": 0, "y": 0, "yanchor": "top", "itemsizing": "constant"}
     figure.update_layout(
@@ -106,7 +98,7 @@ def save_imitation_page(path: str | os.PathLike, scene: ImitationScene, title: s
         font={"color": INK, "size": 13},
         **layout,
     )
-    write_page("save_imitation_page()", path, figure, title or "Imitation", _lead(scene, modes), motion)
+    return page_of(function, figure, title or "Imitation", _lead(scene, modes), motion)
 
 
 def distinct_picks(scene: ImitationScene) -> list[Mode]:
@@ -121,36 +113,7 @@ def above(mode: Mode, best: Mode) -> str:
     return f"{mode.energy / best.energy - 1:.0%} above the best".replace("%", " %")
 
 
-class _Panel:
-    """What one side shows, metres, world frame."""
-
-    def __init__(
-        self,
-        motion: Motion,
-        points: np.ndarray,
-        mesh: "trimesh.Trimesh | None",
-        target: np.ndarray | None,
-        path: np.ndarray,
-    ):
-        self.motion, self.points, self.mesh, self.target, self.path = motion, points, mesh, target, path
-
-    def content(self, box: np.ndarray) -> np.ndarray:
-        """All that is shown in any frame, (points, 3), metres."""
-        motion, cloud = self.motion, thinned(self.points)
-        objects = np.einsum("fij,nj->fni", motion.object_rotations, cloud) + motion.object_translations[:, None]
-        boxes = np.einsum("fij,nj->fni", motion.rotations, box) + motion.translations[:, None]
-        parts = [objects.reshape(-1, 3), boxes.reshape(-1, 3), self.path[:, 4:]]
-        return np.concatenate(parts if self.target is None else [*parts, self.target])
-
-
-def _target_points(scene: ImitationScene) -> np.ndarray | None:
-    target = scene.demonstration.target
-    if scene.target_points is not None:
-        return np.asarray(scene.target_points)
-    return None if target is None else np.asarray(target.points)
-
-
-def _draw(plotly, drawn: list, moving: list[dict], name: str, panel: _Panel, box: Float[np.ndarray, "8 3"]) -> None:
+def _draw(plotly, drawn: list, moving: list[dict], name: str, panel: Side, box: Float[np.ndarray, "8 3"]) -> None:
     first = name == "scene"
     motion = panel.motion
     if panel.target is not None:

@@ -1,6 +1,7 @@
 """A page for a browser: one file that holds plotly's script, compressed, and opens without a network."""
 
 import base64
+import dataclasses
 import gzip
 import html
 import json
@@ -15,6 +16,7 @@ from tdf_jax._internal.files import replace_file
 from tdf_jax.viz.style import INK
 
 LARGEST = 5_000_000  # bytes of a page: mail and issue trackers take it
+HEIGHT = 560  # pixels, of a page in a notebook
 DIAGONAL = 1.9  # of a scene, in plotly's unit
 TIMELINE = """
 <div id="timeline"><button id="play">Play</button>
@@ -144,14 +146,42 @@ def pages(function: str) -> Any:
     return plotly.graph_objects
 
 
-def write_page(
-    function: str, path: str | os.PathLike, figure: Any, title: str, lead: str = "", motion: dict | None = None
-) -> None:
-    """Write a figure of plotly as a page.
+@dataclasses.dataclass(frozen=True)
+class Page:
+    """A page that opens without a network, and shows itself in a notebook.
+
+    Attributes:
+        text: the page, HTML.
+        function: name that error messages begin with.
+        height: height in a notebook, pixels.
+    """
+
+    text: str = dataclasses.field(repr=False)
+    function: str = "page()"
+    height: int = HEIGHT
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the page as a file.
+
+        Args:
+            path: the .html file, in an existing folder; it appears only once it is complete.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        replace_file(self.function, Path(path), self.text.encode())
+
+    def _repr_html_(self) -> str:
+        # A page within the page: its script and its style are its own, and the notebook keeps it.
+        inside = html.escape(self.text)
+        return f'<iframe srcdoc="{inside}" style="width: 100%; height: {self.height}px; border: 0"></iframe>'
+
+
+def page_of(function: str, figure: Any, title: str, lead: str = "", motion: dict | None = None) -> Page:
+    """A figure of plotly as a page.
 
     Args:
-        function: name that the error message begins with.
-        path: the file, in an existing folder; it appears only once it is complete.
+        function: name that error messages begin with.
         figure: the `plotly.graph_objects.Figure`.
         title: title of the page.
         lead: lines under the title, plain text.
@@ -161,12 +191,12 @@ def write_page(
             whose points are those of the trace one after the other. None if nothing moves.
 
     Raises:
-        InputError: the page would have more than `LARGEST` bytes, or the file cannot be written.
+        InputError: the page would have more than `LARGEST` bytes.
     """
     from plotly.offline import get_plotlyjs
 
     content = json.loads(figure.to_json()) | (motion or {})
-    page = PAGE % {
+    text = PAGE % {
         "title": html.escape(title),
         "lead": "".join(f"<p>{html.escape(line)}</p>" for line in lead.splitlines()),
         "ink": INK,
@@ -174,12 +204,12 @@ def write_page(
         "plotly": _packed(get_plotlyjs()),
         "content": _packed(json.dumps(content, separators=(",", ":"))),
     }
-    if len(page) > LARGEST:
+    if len(text) > LARGEST:
         raise InputError(
-            f"{function}: the page would have {len(page) / 1e6:.1f} MB; expected at most {LARGEST / 1e6:g} MB. Use "
+            f"{function}: the page would have {len(text) / 1e6:.1f} MB; expected at most {LARGEST / 1e6:g} MB. Use "
             "fewer points, a coarser grid or a mesh with fewer triangles"
         )
-    replace_file(function, Path(path), page.encode())
+    return Page(text, function)
 
 
 def camera(angles: dict[str, float], distance: float) -> dict:
@@ -201,10 +231,11 @@ def scene_axes(low: np.ndarray, high: np.ndarray) -> dict[str, Any]:
         low: least coordinates of what is shown, (3,), centimetres.
         high: largest coordinates.
     """
-    look = {"backgroundcolor": "#f7f7f7", "gridcolor": "#dedede", "showbackground": True, "nticks": 6}
+    look = {"backgroundcolor": "#f7f7f7", "gridcolor": "#dedede", "showbackground": True}
+    ticks = np.round(2 + 4 * (high - low) / (high - low).max())  # those of a short axis would touch
     axes = {
-        f"{axis}axis": look | {"title": f"{axis} (cm)", "range": listed(np.array([least, most]))}
-        for axis, least, most in zip("xyz", low, high)
+        f"{axis}axis": look | {"title": f"{axis} (cm)", "range": listed(np.array([least, most])), "nticks": int(count)}
+        for axis, least, most, count in zip("xyz", low, high, ticks)
     }
     ratio = DIAGONAL * (high - low) / np.linalg.norm(high - low)
     return axes | {"aspectmode": "manual", "aspectratio": dict(zip("xyz", listed(ratio)))}

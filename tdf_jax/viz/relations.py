@@ -20,14 +20,13 @@ from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.solvers.result import Result
 from tdf_jax.viz import polygons3d
-from tdf_jax.viz.scene3d import SHOWN_POINTS, VIEW, WIDTH, bounds, frame
+from tdf_jax.viz.scene3d import MARGIN, SHOWN_POINTS, VIEW, WIDTH, bounds, frame
 from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, STYLE, TRUTH, add_axes3d, blank_figure, set_view
 
 BEFORE, AFTER, TARGET, CONTACT = COLOURS(0.0), COLOURS(0.62), CLOUD, TRUTH
 HEIGHT = 7.2  # inches
 TITLE = 95  # characters of a line of the title
 SIZE = 2.4  # of a square point, typographic points squared
-MARGIN = 1.08  # length of the axes, in that of their contents
 ZOOM = 1.03, 0.93  # of the overviews, whose long boxes leave room, and of the close-ups
 CLOSE_UPS = {
     "demonstration": "demonstration, at the release",

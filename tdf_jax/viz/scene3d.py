@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 WIDTH = 7.2  # width of a page's text, inches
 SHOWN_POINTS = 1500  # points of a cloud; more points overlap at the width of a page
 VIEW = {"elev": 22.0, "azim": -38.0}  # the handle faces the reader, and the path runs to the right
+TICKS, LABEL = 4, -3.5  # intervals between ticks on the longest axis, and points between ticks and the axis's name
+MARGIN = 1.06  # length of the axes, in that of their contents
 MOST_TRIANGLES = 40_000  # a mesh with more triangles is drawn as points, because matplotlib would take seconds
 
 
@@ -142,9 +144,9 @@ def frame(axes: Axes3D, content: Float[np.ndarray, "points 3"], size: Float[np.n
     centre = (content.min(axis=0) + content.max(axis=0)) / 2
     for name, middle, length in zip("xyz", CENTIMETRES * centre, CENTIMETRES * size):
         getattr(axes, f"set_{name}lim")(middle - length / 2, middle + length / 2)
-        getattr(axes, f"set_{name}label")(f"{name} (cm)", labelpad=-6)
+        getattr(axes, f"set_{name}label")(f"{name} (cm)", labelpad=LABEL)
         axis = getattr(axes, f"{name}axis")
-        axis.set_major_locator(MaxNLocator(4))
+        axis.set_major_locator(MaxNLocator(round(1 + (TICKS - 1) * length / max(CENTIMETRES * size))))
         axis.set_pane_color((0.97, 0.97, 0.97))
         axis._axinfo["grid"].update(color=(0.87, 0.87, 0.87), linewidth=0.5)
     axes.tick_params(pad=-2, labelsize=7)
@@ -166,7 +168,7 @@ def panels(
     """
     rows = -(-len(views) // columns)
     contents = [content(view, box) for _, view in views]
-    size = np.max([np.ptp(one, axis=0) for one in contents], axis=0) * 1.06
+    size = np.max([np.ptp(one, axis=0) for one in contents], axis=0) * MARGIN
     height = 6.6 / columns * rows + 0.6
     foot = 0.6 / height
     with matplotlib.rc_context(STYLE):

@@ -17,15 +17,15 @@ from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.uncertainty.modes import Mode
 from tdf_jax.viz import polygons3d
 from tdf_jax.viz.motion import motion_of
-from tdf_jax.viz.scene3d import View, bounds, content, draw, frame, thinned, triangles_of
+from tdf_jax.viz.scene3d import MARGIN, View, bounds, content, draw, frame, thinned, triangles_of
 from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, LIGHT, STYLE, add_axes3d, blank_figure, legend_of
 
 if TYPE_CHECKING:
     import trimesh
 
 SIZE = 4.6, 4.2  # inches, of a new figure with one 3-D panel
-MARGIN = 1.06  # length of the axes, in that of their contents
 ESTIMATE = "#2a6f97"
+LEAST_RANGE = 1.05  # highest energy of a scale of colours, in the lowest: one pick has a scale too
 
 
 def axes3d(function: str, ax: Any | None) -> tuple[Figure, Axes3D]:
@@ -111,7 +111,7 @@ def candidates_panel(
         query: query points, (queries, 3), metres, query frame.
     """
     energies = [mode.energy for mode in modes]
-    scale = Normalize(energies[0], max(energies[-1], energies[0] * (1 + 1e-6)))
+    scale = Normalize(energies[0], max(energies[-1], LEAST_RANGE * energies[0]))
     cloud = thinned(points)
     size: Any = 2.0
     ax.computed_zorder = False
@@ -188,7 +188,7 @@ def _legend(ax: Axes3D, without: str | None = None) -> None:
     if legend:
         place = {
             "loc": "upper center",
-            "bbox_to_anchor": (0.5, -0.02),
+            "bbox_to_anchor": (0.5, -0.06),
             "frameon": False,
             "fontsize": 7,
             "markerscale": 2,
