@@ -70,8 +70,8 @@ def episode_page(function: str, playback: Playback) -> Page:
         shares = {"name": "cloud of the object at the start", "visible": "legendonly"}
         drawn.append(plotly.Scatter3d(**_axes(playback.points), mode="markers", marker=marker, **shares))
     if len(playback.path):
-        marks = {"mode": "lines+markers", "line": {"color": INK, "width": 4}, "marker": {"size": 2, "color": INK}}
-        drawn.append(plotly.Scatter3d(**_axes(playback.path[:, 4:]), name="imitated path of the gripper", **marks))
+        look = {"mode": "lines", "line": {"color": INK, "width": 4}}
+        drawn.append(plotly.Scatter3d(**_axes(playback.path[:, 4:]), name="imitated path of the gripper", **look))
     figure = plotly.Figure(drawn)
     low, high = _room(playback)
     legend = {"orientation": "h", "x": 0, "y": 0, "yanchor": "top", "itemsizing": "constant"}
