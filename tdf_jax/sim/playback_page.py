@@ -105,7 +105,7 @@ def _part(solid: Solid, poses: Float[np.ndarray, "frames 7"]) -> dict[str, np.nd
     """
     from scipy.spatial.transform import Rotation
 
-    there = np.isfinite(poses).all(axis=1)
+    there = np.asarray(np.isfinite(poses).all(axis=1))
     R = np.zeros((len(poses), 3, 3))
     if there.any():
         R[there] = Rotation.from_quat(poses[there, :4], scalar_first=True).as_matrix()

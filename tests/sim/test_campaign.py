@@ -7,6 +7,7 @@ import types
 import numpy as np
 import pytest
 import trimesh
+from conftest import DOWN
 from PIL import Image
 
 from tdf_jax._internal.errors import InputError
@@ -245,7 +246,8 @@ def test_a_demonstration_that_cannot_be_drawn_is_tried_once(imitator, monkeypatc
 
 
 def test_what_was_imitated_is_kept(imitator, monkeypatch):
-    paths, motion = np.random.default_rng(0).normal(size=(2, 3, 4, 4)), np.diag([1.0, 1, 1, 1])
+    paths, motion = np.tile(DOWN, (2, 3, 1, 1)), np.diag([1.0, 1, 1, 1])
+    paths[..., :3, 3] = np.random.default_rng(0).normal(size=(2, 3, 3))
     monkeypatch.setattr(Imitator, "imitated", lambda self, episode, shown: (list(paths), np.zeros((0, 3)), motion))
     far = Outcome.failure("unreachable", "far")
     monkeypatch.setattr("tdf_jax.sim.episode.run_episode", lambda *arguments, **keywords: far)
