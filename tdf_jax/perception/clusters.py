@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import host
 from tdf_jax._internal.errors import InputError
-from tdf_jax.perception.support import LEAST_AREA, LEAST_SHARE, find_support
+from tdf_jax.perception.support import find_support, no_plane
 from tdf_jax.perception.voxels import canonical_order, voxels_of
 
 GAP = 0.02  # metres: objects at 3 cm stand apart, and parts of one object that hide each other mostly do not
@@ -117,11 +117,7 @@ def _above_table(function: str, view: np.ndarray, camera) -> tuple[np.ndarray, n
     """Points of a view above its largest plane, their heights, and those up to which a point is the plane's."""
     support = find_support(function, view, camera)
     if support is None:
-        raise InputError(
-            f"{function}: there is no plane of {LEAST_AREA} cm2 that covers {LEAST_SHARE:.0%} of the surface that "
-            f"{len(view)} points show; expected a table. If there is none, or it is removed already, pass "
-            "plane=False"
-        )
+        raise no_plane(function, len(view), "If there is none, or it is removed already, pass plane=False")
     heights, bands = support.heights(view), support.bands(view)
     front = heights > bands
     return view[front], heights[front], bands[front]

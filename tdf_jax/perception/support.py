@@ -121,10 +121,7 @@ def remove_plane(
     cloud = np.asarray(checks.points(function, points))
     support = find_support(function, cloud, camera)
     if support is None:
-        raise InputError(
-            f"{function}: there is no plane of {LEAST_AREA} cm2 that covers {LEAST_SHARE:.0%} of the surface that "
-            f"{len(cloud)} points show; expected a table. Check the unit, or go on without this step"
-        )
+        raise no_plane(function, len(cloud), "Check the unit, or go on without this step")
     kept = cloud[support.in_front(cloud)]
     if not len(kept):
         raise InputError(
@@ -178,6 +175,20 @@ def find_support(
     one = Support(plane, noise)
     sign = _side(exact, one) if position is None else np.sign(position @ plane[:3] + plane[3])
     return Support(plane * (sign or 1.0), noise)
+
+
+def no_plane(function: str, count: int, fix: str) -> InputError:
+    """The error where `find_support` finds nothing.
+
+    Args:
+        function: name that the message begins with.
+        count: number of points of the scene.
+        fix: what to do, a sentence without its full stop.
+    """
+    return InputError(
+        f"{function}: there is no plane of {LEAST_AREA} cm2 that covers {LEAST_SHARE:.0%} of the surface that {count} "
+        f"points show; expected a table. {fix}"
+    )
 
 
 def _hypotheses(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "hypotheses 4"]:
