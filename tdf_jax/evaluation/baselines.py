@@ -14,6 +14,7 @@ from tqdm.auto import tqdm
 
 from tdf_jax._internal import checks
 from tdf_jax.evaluation.cases import Case
+from tdf_jax.evaluation.tabletop import moved
 from tdf_jax.geometry import se3
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def principal_axes(
     axes_a, axes_b = _axes(points_a), _axes(points_b)
     tree_b = KDTree(points_b)
     motions = [_motion((axes_b * signs) @ axes_a.T, points_a.mean(axis=0), points_b.mean(axis=0)) for signs in SIGNS]
-    distances = [chamfer_distance(_moved(T, points_a), points_b, tree_b) for T in motions]
+    distances = [chamfer_distance(moved(points_a, T), points_b, tree_b) for T in motions]
     return motions[int(np.argmin(distances))]
 
 
@@ -163,7 +164,7 @@ def _icp(T_a_b, points_a, points_b, tree_a):
     """The motion at convergence, and its mean squared distance."""
     cost = np.inf
     for _ in range(MAX_STEPS):
-        distances, nearest = tree_a.query(_moved(T_a_b, points_b))
+        distances, nearest = tree_a.query(moved(points_b, T_a_b))
         before, cost = cost, float(np.mean(distances**2))
         if cost >= (1 - TOLERANCE) * before:
             break
@@ -182,7 +183,3 @@ def _motion(R, centre_a, centre_b):
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, centre_b - R @ centre_a
     return T
-
-
-def _moved(T, points):
-    return points @ T[:3, :3].T + T[:3, 3]

@@ -182,7 +182,7 @@ def generated_case(
     size = None if natural else (FAMILIES[category].size if size is None else size) * scale
     a = object_of(category, seed, 2 * index, size)
     b = object_of(category, seed, 2 * index + 1, size, fold=a.fold)
-    return _case(a, b, seed, index, points, place, clouds, f"{category} {index}", clutter, stand)
+    return _case("generated_case()", a, b, seed, index, points, place, clouds, f"{category} {index}", clutter, stand)
 
 
 def mug_case(
@@ -226,7 +226,7 @@ def mesh_case(
     number = zlib.crc32(f"{target.name}/{pose}".encode())
     b = target if scale == 1 else target.scaled(scale)
     a = object_of(b.category, seed, number, size_of(b), b.fold)
-    return _case(a, b, seed, number, points, place, clouds, target.name, clutter, stand)
+    return _case("mesh_case()", a, b, seed, number, points, place, clouds, target.name, clutter, stand)
 
 
 def place_demonstration(
@@ -264,6 +264,7 @@ def _scale(function: str, clouds: str, clutter: str, stand: str) -> float:
 
 
 def _case(
+    function: str,
     a: Shape,
     b: Shape | AnnotatedMesh,
     seed: int,
@@ -277,7 +278,7 @@ def _case(
 ) -> Case:
     places = FAMILIES[a.category].places
     place = places[0] if place is None else place
-    checks.choice("generated_case()", f"place of a {a.category}", place, places)
+    checks.choice(function, f"place of a {a.category}", place, places)
     rng = np.random.default_rng([SEED_SPACE, seed, number, 1])
     cloud_a, cloud_b = (sample_surface(one.mesh, points, rng) for one in (a, b))
     others = b.others(place) if isinstance(b, Shape) else ()

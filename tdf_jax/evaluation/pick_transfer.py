@@ -19,7 +19,7 @@ from tdf_jax.evaluation.baselines import METHODS, aligned
 from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, Case, Transfer
 from tdf_jax.evaluation.metrics import FLIP_DEGREES, nearest_place, pose_error
 from tdf_jax.evaluation.statistics import SUCCESS, THRESHOLDS, percentiles, success_rates
-from tdf_jax.evaluation.tabletop import SEEN_POINTS
+from tdf_jax.evaluation.tabletop import SEEN_POINTS, moved
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.query import box_query
 from tdf_jax.geometry.symmetry import FOLDS
@@ -176,7 +176,7 @@ def overlaps(
         true = case.object_b.contains(x)
         measured: dict[str, float | None] = dict.fromkeys(OVERLAPS)
         if true is not None:
-            world = (x @ case.T_world_b[:3, :3].T + case.T_world_b[:3, 3]).astype(np.float32)
+            world = moved(x, case.T_world_b).astype(np.float32)
             points = jax.device_put(case.points_b)
             field = encode(model, points)
             for name, shape in zip(OVERLAPS, (field, refine(model, field, points))):

@@ -20,6 +20,7 @@ from tdf_jax.energy.reference import Reference, describe
 from tdf_jax.evaluation.baselines import iterative_closest_points
 from tdf_jax.evaluation.relation_success import Placed, judge
 from tdf_jax.evaluation.relation_tasks import Placement, demonstrate, draw_pair, place_pair
+from tdf_jax.evaluation.tabletop import moved
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory
@@ -206,17 +207,17 @@ class _Attempts:
         demonstration, placement = self._demonstrators.shown(max(self._shown, 0)), self._placement
         target = demonstration.target
         points, target_points = np.asarray(demonstration.points, float), np.asarray(target.points, float)
-        moved = np.asarray(Trajectory(jnp.asarray(demonstration.object_motion)[None]).matrices[0], float)
+        demonstrated = np.asarray(Trajectory(jnp.asarray(demonstration.object_motion)[None]).matrices[0], float)
         began = time.perf_counter()
         if method == "centroids":
             # The demonstrated offset of the centroids, in the world's axes, and no turn.
             motion = np.eye(4)
-            offset = (points @ moved[:3, :3].T + moved[:3, 3]).mean(axis=0) - target_points.mean(axis=0)
+            offset = moved(points, demonstrated).mean(axis=0) - target_points.mean(axis=0)
             motion[:3, 3] = placement.target_points.mean(axis=0) + offset - placement.points.mean(axis=0)
         else:
             key = jax.random.fold_in(jax.random.key(self._seed), self._number)
             rotations = np.asarray(se3.uniform_rotations(key, ICP_STARTS), float)
             of_object = iterative_closest_points(points, placement.points, rotations)
             of_target = iterative_closest_points(target_points, placement.target_points, rotations)
-            motion = of_target @ moved @ np.linalg.inv(of_object)
+            motion = of_target @ demonstrated @ np.linalg.inv(of_object)
         return motion, time.perf_counter() - began

@@ -96,7 +96,7 @@ def build_tabletop(
         neighbour: mesh of the other object, metres; z is up.
         gap: distance between the two, metres.
     """
-    corners = mesh.vertices @ T_world_object[:3, :3].T + T_world_object[:3, 3]
+    corners = moved(mesh.vertices, T_world_object)
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     # The cameras have a generator of their own, so that a neighbour or one camera more does not move the first.
     cameras = camera_poses(max(count, 1), middle, np.random.default_rng(rng.integers(2**63)))
@@ -149,9 +149,9 @@ def complete_cloud(
 def camera_cloud(table: Tabletop, clutter: str, rng: np.random.Generator) -> tuple[Float[np.ndarray, "all 3"], int]:
     """The cloud of an object from depth images, perhaps with foreign points of the same images.
 
-    The images become points by `points_from_depth`, and the table is removed by `separate_objects`, of several images
-    by `remove_plane` in each of them. Of the clusters,
-    the one with most of the object's points is taken. With clutter, its points of anything but the object are replaced.
+    The images become points by `points_from_depth`; `separate_objects` removes the table from each and finds clusters.
+    The cluster with most of the object's points is taken. With clutter, its points of anything but the object are
+    replaced.
 
     Args:
         table: the object on the table, and the cameras.
