@@ -7,6 +7,8 @@ Modules:
     pictures: optional outputs, which may fail
     streams: standard output and error, which may fail
     episodes: rows of simulated episodes beside published ones
+    pairs: objects placed on targets by the library and by baselines
+    attempts: the folder of what a benchmark has computed
     targets: the objects of a folder, one after the other
     tasks: generated objects and targets
 """

@@ -13,8 +13,7 @@ _CATEGORY = "(default: those of the category)"
 _ALL = "(default: all)"
 _PROTOCOLS = "(default: those of the published protocols)"
 _CORES = "(default: one for every core)"
-PAGE, RECORD, RUNS = "benchmark.md", "benchmark.json", "runs"
-RELATIONS_PAGE, RELATIONS_RECORD = "relations.md", "relations.json"
+PAGE, RECORD = "benchmark.md", "benchmark.json"
 Task = Literal["bowl_on_mug", "mug_on_rack", "bottle_in_container", "bowl_on_shelf", "bottle_on_shelf"]
 Pose = Literal["upright", "tilt60", "uniform"]
 Cloud = Literal[
@@ -107,6 +106,7 @@ def benchmark(
     """
     from tdf_jax._internal.errors import InputError
     from tdf_jax._internal.files import replace_file
+    from tdf_jax.cli.attempts import attempts_folder
     from tdf_jax.evaluation.annotated_meshes import load_annotated
     from tdf_jax.evaluation.demonstration_count import count_errors
     from tdf_jax.evaluation.path_methods import METHODS
@@ -152,13 +152,15 @@ def benchmark(
         )  # fmt: skip
     methods = _given(methods, ("all",))
     if relations:
+        from tdf_jax.cli.pairs import measure
+
         settings = {
             "pairs": pairs, "seed": seed, "clouds": clouds, "methods": methods,
             "demonstrations": demonstrations or (1,), "tasks": _given(tasks, typing.get_args(Task)[:3]),
             "pose": _given(pose, typing.get_args(Pose)), "object_weights": object_weights,
             "target_weights": target_weights,
         }  # fmt: skip
-        return _relations(out, settings)
+        return measure(out, settings)
     _check(pairs, seed, height, clouds, methods, num_starts, meshes, num_poses, demonstrations)
     names = list(METHODS) if "all" in methods else [name for name in METHODS if name in methods]
     if meshes is not None:
@@ -171,7 +173,7 @@ def benchmark(
                 "other objects"
             )
     model = load_model(weights)
-    folder = _folder(out)
+    folder = attempts_folder("tdf benchmark", out, PAGE, RECORD)
     makers = [
         make
         for condition in dict.fromkeys(clouds)
@@ -227,104 +229,6 @@ def _refuse_unused(kind: str, options: dict[str, tuple[bool, tuple[str, ...]]]) 
         )
 
 
-def _relations(out: Path, settings: dict) -> None:
-    """`tdf benchmark --relations`."""
-    from tdf_jax._internal import checks
-    from tdf_jax._internal.errors import InputError
-    from tdf_jax._internal.files import replace_file
-    from tdf_jax.evaluation.conditions import SCALES
-    from tdf_jax.evaluation.records import write_record
-    from tdf_jax.evaluation.relation_report import page, record
-    from tdf_jax.evaluation.relation_scores import DEMONSTRATIONS, LIBRARY, METHODS, UNSEATED, Condition, Networks, run
-    from tdf_jax.evaluation.relation_tasks import RELATIONS, draw_pair
-    from tdf_jax.geometry.winding import libigl
-    from tdf_jax.networks.checkpoint import load_model
-
-    checks.count("tdf benchmark", "--pairs", settings["pairs"])
-    checks.seed("tdf benchmark", settings["seed"], "--seed")
-    for name in settings["methods"]:
-        checks.choice("tdf benchmark", "--methods", name, (*METHODS, "all"))
-    names = [name for name in METHODS if {name, "all"} & set(settings["methods"])]
-    for task in settings["tasks"]:
-        checks.choice("tdf benchmark --relations", "--tasks", task, RELATIONS)
-    for flag in ("methods", "clouds", "tasks", "pose"):
-        if not settings[flag]:
-            raise InputError(f"tdf benchmark: --{flag} is empty; expected at least one")
-    for condition in settings["clouds"]:
-        if condition in SCALES:
-            raise InputError(
-                f"tdf benchmark: --clouds is {condition!r}; expected no condition of size with --relations, whose "
-                "objects have their natural size"
-            )
-    for count in settings["demonstrations"]:
-        checks.choice("tdf benchmark", "--demonstrations", count, (1, DEMONSTRATIONS))
-    if 1 not in settings["demonstrations"] and not {LIBRARY, UNSEATED} & set(names):
-        raise InputError(
-            f"tdf benchmark --relations: --methods {' '.join(names)} have one demonstration, and --demonstrations is "
-            f"{DEMONSTRATIONS}; expected 1"
-        )
-    for flag, side in (("object_weights", "object"), ("target_weights", "target")):
-        sides = sorted({getattr(RELATIONS[task], side) for task in settings["tasks"]})
-        if settings[flag] is not None and len(sides) > 1:
-            raise InputError(
-                f"tdf benchmark: --{flag.replace('_', '-')} is given, and --tasks need weights of {', '.join(sides)}; "
-                "expected tasks of one category there"
-            )
-    libigl("tdf benchmark --relations")
-    load = functools.cache(load_model)
-    networks = {
-        task: Networks(
-            load(settings["object_weights"] or RELATIONS[task].object),
-            load(settings["target_weights"] or RELATIONS[task].target),
-        )
-        for task in dict.fromkeys(settings["tasks"])
-    }
-    conditions = [
-        Condition(task, poses, clouds, count)
-        for task in dict.fromkeys(settings["tasks"])
-        for clouds in dict.fromkeys(settings["clouds"])
-        for poses in dict.fromkeys(settings["pose"])
-        for count in dict.fromkeys(settings["demonstrations"])
-    ]
-    folder = _folder(out, RELATIONS_PAGE, RELATIONS_RECORD)
-    scores = list(run(conditions, networks, names, folder, pairs=settings["pairs"], seed=settings["seed"]))
-    redrawn = {
-        task: sum(draw_pair(task, settings["seed"], number).redrawn for number in range(settings["pairs"]))
-        for task in dict.fromkeys(settings["tasks"])
-    }
-    write_record("tdf benchmark", out / RELATIONS_RECORD, record(scores, networks, settings, redrawn), indent=None)
-    replace_file("tdf benchmark", out / RELATIONS_PAGE, page(scores, settings, redrawn).encode())
-    print(out / RELATIONS_PAGE)
-    _draw_failures(out, scores, settings["seed"])
-
-
-def _draw_failures(out: Path, scores, seed: int) -> None:
-    from tdf_jax.cli.pictures import Pictures
-    from tdf_jax.evaluation.relation_report import failures, penetration, picture
-    from tdf_jax.evaluation.relation_tasks import draw_pair, place_pair
-
-    pictures = Pictures("tdf benchmark")
-    for task in dict.fromkeys(one.condition.task for one in scores):
-        failed = failures(scores, task)
-        if not failed:
-            (out / picture(task)).unlink(missing_ok=True)  # that of an earlier run with fewer pairs
-            continue
-        with pictures.drawing(out / picture(task)) as path:
-            from tdf_jax.viz.placements import PlacedMeshes, placements_figure
-            from tdf_jax.viz.style import save_figure
-
-            drawn = []
-            for one in failed:
-                pair = draw_pair(task, seed, one.number)
-                placement = place_pair(pair, seed, one.condition.poses, one.condition.clouds)
-                lengths = f"gap {1e3 * one.placed.gap:.0f} mm, penetration {penetration(one.placed)} mm"
-                title = f"{one.condition.poses}, {one.condition.clouds}, pair {one.number}\n{lengths}"
-                found, frames = placement.placed(one.motion), (pair.T_target_object, pair.T_target_contact)
-                drawn.append(PlacedMeshes(title, pair.object.mesh, pair.target.mesh, found, *frames))
-            save_figure(path, placements_figure(drawn))
-    pictures.check()
-
-
 def _makers(pairs, seed, height, clouds, targets, num_poses) -> list[Callable]:
     from tdf_jax.evaluation.cases import mesh_case, mug_case
     from tdf_jax.evaluation.path_tasks import make_task, mesh_index
@@ -374,22 +278,6 @@ def _draw(out, makers, scores, extras) -> None:
 
             save_figure(path, figure(name))
     pictures.check()
-
-
-def _folder(out: Path, page: str = PAGE, record: str = RECORD) -> Path:
-    """The folder of computed attempts, made at the start: an error at the end would lose an hour of work."""
-    from tdf_jax._internal.errors import InputError
-
-    if (out / page).exists() and not (out / record).exists():
-        raise InputError(
-            f"tdf benchmark: {out / page} is not of an earlier benchmark, there is no {record} beside it; expected "
-            "another --out: nothing of yours is overwritten"
-        )
-    try:
-        (out / RUNS).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"tdf benchmark: cannot make the folder {out} ({error}); expected a writable place") from None
-    return out / RUNS
 
 
 def _check(pairs, seed, height, clouds, methods, num_starts, meshes, num_poses, demonstrations) -> None:

