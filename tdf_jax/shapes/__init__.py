@@ -5,10 +5,13 @@ Modules:
     bowl: bowls
     container: bins and shelves to stand bottles in
     convex: convex parts of generated objects for physics engines
+    frusta: convex parts of solid bodies
     mug: mugs
     rack: racks to hang mugs on
+    sectors: convex parts of walls around hollows
     shape: base class of generated objects
     solid: parts of solids, their meshes and exact inside tests
+    stacks: rings along an axis, and where convex parts cut them
 """
 
 from collections.abc import Callable
