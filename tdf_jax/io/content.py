@@ -65,7 +65,8 @@ def known_suffix(function: str, path: str | Path, suffixes: tuple[str, ...]) -> 
     """
     path = checks.path(function, path)
     if path.suffix.lower() not in suffixes:
-        raise InputError(f"{function}: {path} has suffix {path.suffix!r}; expected one of {', '.join(suffixes)}")
+        expected = suffixes[0] if len(suffixes) == 1 else f"one of {', '.join(suffixes)}"
+        raise InputError(f"{function}: {path} has suffix {path.suffix!r}; expected {expected}")
     return path
 
 

@@ -1,7 +1,6 @@
 """Demonstrations in files: one .npz file of named arrays."""
 
 import os
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +15,7 @@ from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.target import Target
 from tdf_jax.geometry.trajectory import Trajectory, check_trajectory
+from tdf_jax.io.content import known_suffix
 
 ARRAYS = ("points", "wxyz_xyz", "query")
 INDICES = {"grasp": 0, "release": -1}  # with the values that files without them have
@@ -48,7 +48,7 @@ def save_demonstration(path: str | os.PathLike, demonstration: Demonstration) ->
     Raises:
         InputError: the suffix is not .npz, or the file cannot be written.
     """
-    path = _npz("save_demonstration()", path)
+    path = known_suffix("save_demonstration()", path, (".npz",))
     arrays = {
         "points": np.asarray(demonstration.points),
         "wxyz_xyz": np.asarray(demonstration.trajectory.wxyz_xyz),
@@ -82,7 +82,7 @@ def load_demonstration(path: str | os.PathLike) -> Demonstration:
         InputError: the file is missing, unreadable or of a newer tdf_jax, an array is missing, the arrays are not a
             demonstration, or its unit or frames are wrong.
     """
-    path = _npz("load_demonstration()", path)
+    path = known_suffix("load_demonstration()", path, (".npz",))
     checks.existing_file("load_demonstration()", path)
     try:
         with path.open("rb") as file, np.lib.npyio.NpzFile(file, allow_pickle=False) as archive:
@@ -199,10 +199,3 @@ def _gap(points: np.ndarray, wxyz_xyz: np.ndarray, query: np.ndarray) -> float:
     """Distance from the centroid of the query points, carried by a pose, to the nearest point."""
     centroid = np.asarray(se3.transform(jnp.asarray(wxyz_xyz), jnp.asarray(query.mean(axis=0)[None])))[0]
     return float(np.linalg.norm(points - centroid, axis=1).min())
-
-
-def _npz(function: str, path: str | os.PathLike) -> Path:
-    path = checks.path(function, path)
-    if path.suffix != ".npz":
-        raise InputError(f"{function}: {path} has suffix {path.suffix!r}; expected .npz")
-    return path

@@ -67,7 +67,6 @@ def energy_landscape(
         InputError: `rotation` has no rotations, a choice is unknown, `device_mesh` has another type, or reference and
             field are from different networks.
     """
-    # The level of the caller counts the decorator.
     reduce = check_reduction("energy_landscape()", reduce)
     landscape = blank(field, reference, grid, rotation, reduce, over_rotations=over_rotations, temperature=temperature)
     for done, total in fill(landscape, field, reference, share=share, device_mesh=device_mesh):

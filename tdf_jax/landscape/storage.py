@@ -14,6 +14,7 @@ from tdf_jax._internal.deprecation import warn
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file
 from tdf_jax.geometry.grid import Grid
+from tdf_jax.io.content import known_suffix
 
 REDUCTIONS = ("min", "softmin", "assigned", "mean")
 # Choices of the release before; they are accepted for one release, with a DeprecationWarning.
@@ -52,7 +53,6 @@ class Landscape:
     temperature: float = TEMPERATURE
 
     def __post_init__(self):
-        # The level of the caller counts the constructor that the dataclass generates.
         object.__setattr__(self, "reduce", check_reduction("Landscape()", self.reduce))
         checks.positive("Landscape()", "temperature", self.temperature, unit="an energy")
         shape = (len(self.waypoints), *self.grid.shape)
@@ -172,7 +172,7 @@ def save_landscape(path: str | os.PathLike, landscape: Landscape, about: dict | 
     Raises:
         InputError: the file cannot be written, or its name does not end in .npz.
     """
-    path = _npz("save_landscape", path)
+    path = known_suffix("save_landscape()", path, (".npz",))
     grid = landscape.grid
     header = {
         "format": FORMAT,
@@ -207,7 +207,7 @@ def load_landscape(path: str | os.PathLike) -> tuple[Landscape, dict]:
     Raises:
         InputError: the file does not exist, holds something else or is damaged.
     """
-    path = _npz("load_landscape", path)
+    path = known_suffix("load_landscape()", path, (".npz",))
     try:
         if path.exists() and not path.is_file():  # a pipe would wait for a writer
             raise OSError("it is no file")
@@ -243,10 +243,3 @@ def load_landscape(path: str | os.PathLike) -> tuple[Landscape, dict]:
         raise InputError(
             f"load_landscape(): cannot read {path} ({str(error)[:200]}); expected a file from save_landscape"
         ) from None
-
-
-def _npz(function, path):
-    path = checks.path(f"{function}()", path)
-    if path.suffix != ".npz":
-        raise InputError(f"{function}(): the file is {path}; expected a name that ends in .npz")
-    return path

@@ -98,7 +98,7 @@ def test_other_files_are_refused(tmp_path, landscape):
     with pytest.raises(InputError, match="no file"):
         load_landscape(tmp_path / "none.npz")
     for name in ("it.npy", "it"):
-        with pytest.raises(InputError, match="ends in .npz"):
+        with pytest.raises(InputError, match="expected .npz"):
             save_landscape(tmp_path / name, landscape)
     path = tmp_path / "it.npz"
     np.savez(path, values=landscape.values)
