@@ -23,6 +23,7 @@ from tdf_jax._internal.cache import kept
 from tdf_jax._internal.errors import InputError, TdfWarning
 from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, Case, generated_case
 from tdf_jax.evaluation.pick_transfer import place_errors, place_reference
+from tdf_jax.evaluation.statistics import SUCCESS
 from tdf_jax.evaluation.tables import markdown, percent
 from tdf_jax.evaluation.tabletop import SEEN_POINTS
 from tdf_jax.geometry.query import box_query
@@ -35,7 +36,6 @@ from tdf_jax.uncertainty.calibration import INTERCEPT, SLOPE, calibration_error,
 FORMAT = 1  # format number; raise it when the cases or what is measured change
 CLOUDS = ("full", "views1", "views2", "noise", "camera1")
 BINS = 10  # of equal numbers of picks
-RIGHT = (0.02, 20.0)  # metres and degrees
 LEAST_OF_FIT = 10  # right and wrong picks that a curve needs at least
 
 
@@ -58,7 +58,7 @@ class Pick(NamedTuple):
     @property
     def right(self) -> bool:
         """Whether the pick is right."""
-        return self.distance <= RIGHT[0] and self.angle <= RIGHT[1]
+        return bool(SUCCESS.holds(self.distance, self.angle))
 
 
 def measure(model: Model, category: str, place: str | None, seed: int, number: int) -> Pick:

@@ -210,8 +210,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--out", type=Path, help="JSON file for the record")
     options = parser.parse_args(arguments)
-    if options.count < 1:
-        parser.error(f"--count is {options.count}; expected at least 1")
+    if options.count < 1 or options.seed < 0:
+        parser.error("--count must be at least 1, and --seed at least 0")
+    if options.out is not None and not options.out.parent.is_dir():  # said before the work, not after it
+        parser.error(f"--out is {options.out}; expected a file in an existing folder")
     if options.task is not None and (options.weights is not None or options.category is not None):
         parser.error("--task has weights and categories of its own; drop --weights and --category")
     if options.task is None:

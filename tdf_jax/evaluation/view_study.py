@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from tdf_jax._internal.files import replace_file
 from tdf_jax.energy.reference import Reference, describe
 from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, SEED_SPACE
-from tdf_jax.evaluation.statistics import bootstrap_interval
+from tdf_jax.evaluation.statistics import SUCCESS, bootstrap_interval
 from tdf_jax.evaluation.tables import between, percent
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
@@ -41,7 +41,6 @@ from tdf_jax.uncertainty.calibration import confidence
 SURFACE, POINTS = 12_000, 1500  # points that a camera may see, and most points of a view
 DISTANCE = 0.7  # metres of the camera from the mug
 MARGIN = 0.001  # metres outside the body from which a point is the handle's
-RIGHT = (0.02, 20.0)  # metres and degrees
 
 
 class Case(NamedTuple):
@@ -133,7 +132,7 @@ def picked(
     error = R.T @ np.asarray(se3.rotation(result.pick), float)
     distance = float(np.linalg.norm(R.T @ pick[4:] - mug.handle_frame[:3, 3]))
     angle = float(np.degrees(Rotation.from_matrix(error).magnitude()))
-    right = distance <= RIGHT[0] and angle <= RIGHT[1]
+    right = bool(SUCCESS.holds(distance, angle))
     known = confidence(float(result.residual))
     return right, np.nan if known is None else known, look_from(field, cloud)
 
