@@ -1,11 +1,15 @@
 """A wheel, installed elsewhere, is complete. Pip fetches the build backend from the package index for it."""
 
 import os
+import re
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
+
+import tdf_jax as tdf
 
 ROOT = Path(__file__).parent.parent
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet")
@@ -26,13 +30,33 @@ def run(*command, **options):
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory):
-    """The folder that a fresh wheel is installed to."""
-    built, target = tmp_path_factory.mktemp("wheel"), tmp_path_factory.mktemp("installed")
+def wheel(tmp_path_factory):
+    built = tmp_path_factory.mktemp("wheel")
     run(*PIP, "wheel", ROOT, "--no-deps", "--wheel-dir", built)
     (wheel,) = built.glob("tdf_jax-*.whl")
+    return wheel
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory):
+    """The folder that a fresh wheel is installed to."""
+    target = tmp_path_factory.mktemp("installed")
     run(*PIP, "install", wheel, "--no-deps", "--target", target)
     return target
+
+
+@pytest.mark.slow
+def test_a_wheel_holds_code_and_weights_under_the_licence_and_nothing_else(wheel):
+    """docs/installation.md says its size, and that nothing in it is another project's."""
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+        (metadata,) = (archive.read(name).decode() for name in names if name.endswith(".dist-info/METADATA"))
+    about = r"tdf_jax-[\w.]+\.dist-info/(METADATA|RECORD|WHEEL|entry_points\.txt|licenses/LICENSE)"
+    known = rf"tdf_jax/(\w+/)*\w+\.py|tdf_jax/py\.typed|tdf_jax/weights/\w+\.(safetensors|md)|{about}"
+    assert [name for name in names if not re.fullmatch(known, name)] == []
+    assert sum(name.endswith("licenses/LICENSE") for name in names) == 1
+    assert f"Version: {tdf.__version__}\n" in metadata and "License-Expression: MIT\n" in metadata
+    assert wheel.stat().st_size < 41e6
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Contents of files: bytes, what they hold in spite of the suffix, and the errors of what cannot be read."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -49,7 +50,7 @@ class UnsupportedError(ValueError):
     """Raised for a valid file that uses what is not read; the message says what, what is expected and the fix."""
 
 
-def known_suffix(function: str, path: str | Path, suffixes: tuple[str, ...]) -> Path:
+def known_suffix(function: str, path: str | os.PathLike, suffixes: tuple[str, ...]) -> Path:
     """Check that a path has one of several suffixes, in lower or upper case.
 
     Args:
