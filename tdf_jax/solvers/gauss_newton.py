@@ -125,15 +125,17 @@ def _steps(R, centroid, waypoint, bounds, damping, tolerance, field, problem, en
         parts, part = jax.lax.axis_size(axes), jax.lax.axis_index(axes)
         # Poses assigned to this device.
         bounds = bounds.at[:2].set((bounds[:2] - part + parts - 1) // parts)
-    moving, _, _, steps = bounds
+    moving, evaluated, blocks, steps = bounds
     moves = jnp.arange(len(R)) < moving
 
     def body(carry):
         i, state, damping, step, _, history = carry
         R, centroid = se3.multiply(se3.exp(step[:, :3]), state.R), state.centroid + step[:, 3:]
-        trial = _State(R, centroid, *_evaluate(R, centroid, waypoint, bounds, field, problem, energy, chunk))
+        # A pose that does not move is evaluated once.
+        some = jnp.where(i == 0, evaluated, moving)
+        trial = _State(R, centroid, *_evaluate(R, centroid, waypoint, some, blocks, field, problem, energy, chunk))
         # Energies of the initial state are infinite, so the first step accepts every finite energy.
-        better = trial.energy < state.energy
+        better = (jnp.arange(len(R)) < some) & (trial.energy < state.energy)
         state = jax.tree.map(lambda a, b: jnp.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b), trial, state)
         factor = jnp.where(i == 0, 1.0, jnp.where(better, ACCEPTED, REJECTED))
         damping = jnp.clip(damping * factor, *DAMPINGS)
@@ -178,34 +180,43 @@ def _solved(matrix, right):
     return jax.lax.fori_loop(0, 6, eliminate, jnp.concatenate([matrix, right[..., None]], axis=-1))[..., -1]
 
 
-def _evaluate(R, centroid, waypoint, bounds, field, problem, energy, chunk):
-    """Energies of the poses within the bounds and their quadratic models: (poses,), (poses, 6), (poses, 6, 6)."""
-    _, last, blocks, _ = bounds
-    count = min(max(1, chunk // problem.query.shape[1]), len(R))
-    used = jnp.sum(jnp.where(jnp.arange(len(problem.weights)) < blocks, jnp.sum(problem.weights, axis=1), 0.0))
+def _evaluate(R, centroid, waypoint, some, blocks, field, problem, energy, chunk):
+    """Energies of the first `some` poses and their quadratic models: (poses,), (poses, 6), (poses, 6, 6).
 
-    def some(j, values):
-        # The last chunk begins early rather than run over the end.
-        begin = jnp.minimum(j * count, len(R) - count)
-        R_, centroid_, waypoint_ = (
-            jax.lax.dynamic_slice_in_dim(part, begin, count) for part in (R, centroid, waypoint)
+    What is evaluated at a time are pairs of a pose and a block of query points: few poses with many blocks fill a chunk
+    as well as many poses with one.
+    """
+    every, size = problem.weights.shape
+    count, last = min(max(1, chunk // size), len(R) * every), some * blocks
+    counted = jnp.arange(every) < blocks
+    used = jnp.sum(jnp.where(counted, jnp.sum(problem.weights, axis=1), 0.0))
+
+    def evaluated(j, values):
+        pair = j * count + jnp.arange(count)
+        pose, block = jnp.minimum(pair // blocks, len(R) - 1), pair % blocks
+        terms = _match(
+            R[pose],
+            centroid[pose],
+            field,
+            problem.query[block],
+            problem.weights[block] / used,
+            problem.descriptors[waypoint[pose], block],
         )
-
-        def block(b, total):
-            terms = _match(
-                R_, centroid_, field, problem.query[b], problem.weights[b] / used, problem.descriptors[waypoint_, b]
-            )
-            return jax.tree.map(jnp.add, total, terms)
-
-        total = jax.lax.fori_loop(0, blocks, block, tuple(jnp.zeros_like(part[:count]) for part in values))
         return jax.tree.map(
-            lambda whole, part: jax.lax.dynamic_update_slice_in_dim(whole, part, begin, 0), values, total
+            lambda whole, part: jax.lax.dynamic_update_slice_in_dim(whole, part, j * count, 0), values, terms
         )
 
-    values = tuple(jnp.zeros((len(R), *shape), R.dtype) for shape in ((), (6,), (6, 6)))
-    values = jax.lax.fori_loop(0, (last + count - 1) // count, some, values)
+    room = -(-len(R) * every // count) * count
+    values = tuple(jnp.zeros((room, *shape), R.dtype) for shape in ((), (6,), (6, 6)))
+    values = jax.lax.fori_loop(0, (last + count - 1) // count, evaluated, values)
+    # The pairs of each pose; blocks that do not count read the first pair, and are left out.
+    pair = jnp.where(counted, jnp.arange(len(R))[:, None] * blocks + jnp.arange(every), 0)
+
+    def summed(part):
+        return jnp.sum(jnp.where(counted.reshape(1, -1, *[1] * (part.ndim - 1)), part[pair], 0.0), axis=1)
+
     prior = jax.vmap(lambda R, centroid, target: _prior(R, centroid, target, field.origin, problem.centre, energy))
-    return jax.tree.map(jnp.add, values, prior(R, centroid, problem.target[waypoint]))
+    return jax.tree.map(lambda part, more: summed(part) + more, values, prior(R, centroid, problem.target[waypoint]))
 
 
 def _match(R, centroid, field, query, weights, demonstrated):
@@ -221,7 +232,7 @@ def _match(R, centroid, field, query, weights, demonstrated):
     residual = found - demonstrated.reshape(found.shape)
     size = jnp.abs(residual)
     mean = jnp.mean(size, axis=-1)
-    weights = jnp.tile(weights, len(R))
+    weights = weights.ravel()
     share = (weights / size.shape[-1])[:, None]
     slope = jnp.einsum("pic,pc->pi", tangents, jnp.sign(residual) * share)
     weighted = tangents * (share / jnp.maximum(jnp.maximum(size, mean[:, None]), 1e-9))[:, None]

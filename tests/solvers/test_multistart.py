@@ -59,7 +59,7 @@ def energy_of(trajectories, field, reference, weights=WEIGHTS):
 # ---- the quadratic model ----
 
 
-evaluate = jax.jit(gauss_newton._evaluate, static_argnums=7)
+evaluate = jax.jit(gauss_newton._evaluate, static_argnums=8)
 
 
 def moved(R, place, step):
@@ -79,7 +79,7 @@ def test_energies_and_gradients_are_those_of_the_energy(field, reference, pose_n
     drawn = stages.candidates_of(np, starts, problem)
     R, place = drawn.R.reshape(-1, 3, 3), drawn.centroid.reshape(-1, 3)
     waypoint = np.tile(np.arange(4), 5)
-    values = evaluate(R, place, waypoint, np.array([20, 20, 3, 0]), field, problem, weights, 128)
+    values = evaluate(R, place, waypoint, 20, 3, field, problem, weights, 128)
 
     def energy(step, R, place, index):
         R, place = moved(R, place, step)
@@ -170,16 +170,24 @@ def test_chunks_do_not_show(field, reference):
         drawn.R.reshape(-1, 3, 3),
         drawn.centroid.reshape(-1, 3),
         np.tile(np.arange(4), 2),
-        np.array([8, 8, 3, 0]),
-        field,
-        problem,
-        WEIGHTS,
+        *(8, 3, field, problem, WEIGHTS),
     )
-    # 3 poses at a time: the last chunk overlaps the one before.
-    for part, expected in zip(
-        gauss_newton._evaluate(*settings, 9), gauss_newton._evaluate(*settings, 128), strict=True
-    ):
-        np.testing.assert_allclose(part, expected, rtol=1e-4, atol=1e-6)
+    # 24 pairs of a pose and a block: 3 at a time, 5 at a time, where the last chunk has fewer, and all at once.
+    whole = evaluate(*settings, 128)
+    for chunk in (9, 15):
+        for part, expected in zip(evaluate(*settings, chunk), whole, strict=True):
+            np.testing.assert_allclose(part, expected, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_poses_beyond_those_that_count_have_no_part_in_the_energy(field, reference):
+    problem = solve._problem(KEY, reference, size=3)
+    drawn = stages.candidates_of(np, random_starts(KEY, field, reference, 2, "carried", 0.1), problem)
+    poses = drawn.R.reshape(-1, 3, 3), drawn.centroid.reshape(-1, 3), np.tile(np.arange(4), 2)
+    whole = evaluate(*poses, 8, 3, field, problem, WEIGHTS, 9)
+    first = evaluate(*poses, 5, 3, field, problem, WEIGHTS, 9)
+    for part, expected in zip(first, whole, strict=True):
+        np.testing.assert_allclose(part[:5], expected[:5], rtol=1e-4, atol=1e-6)
 
 
 # ---- from stage to stage ----
