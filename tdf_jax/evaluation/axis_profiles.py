@@ -226,7 +226,7 @@ def _rim(found: Profile, fold: int, name: str) -> float:
         if len(wall) > 1:
             middles.append(wall[-2:].mean())
     if not middles:
-        raise _unmeasured(name, "its rim on the front is no wall with two sides", "a bowl with a wall")
+        raise _unmeasured(name, "its rim on the front is no wall with two sides.", "a bowl with a wall")
     return float(np.median(middles))
 
 

@@ -129,7 +129,7 @@ def _grip(section, height: float, walls, name: str) -> tuple[float, float]:
     z = float(np.mean(near + share * (near - far)))
     bar = crossings(section, z)[-2:]  # inner and outer surface
     if bar[0] < np.interp(z, levels, wall) + CLEAR[0] * height:
-        raise _unmeasured(name, "its handle is open half way between its ends")
+        raise _unmeasured(name, "its handle is open half way between its ends.")
     return float(bar.mean()), z
 
 

@@ -91,6 +91,13 @@ def test_a_wrong_unit_is_warned_of_with_the_likely_one(sized_model, factor, advi
         tdf.encode(sized_model, factor * (CLOUD - CLOUD.mean(axis=0)))
 
 
+def test_a_mesh_in_millimetres_far_from_the_origin_is_refused_with_both_fixes(small_model):
+    with pytest.raises(
+        tdf.InputError, match=r"If they are in millimetres, multiply them by 0\.001\. Subtract one offset"
+    ):
+        tdf.encode(small_model, 1000 * (CLOUD + 0.3))
+
+
 def test_half_and_double_size_and_unknown_sizes_are_not_warned_of(sized_model, small_model):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
