@@ -130,8 +130,6 @@ class HandStage:
 
     def _panel(self) -> None:
         gui = self.server.gui
-        gui.configure_theme(show_logo=False, show_share_button=False)
-        gui.main_panel.dock_right()
         gui.set_panel_label("tdf view: demonstrate")
         gui.add_markdown(
             "1. Drag the box to the part that the gripper touches, or click a point of the object.\n"

@@ -118,9 +118,6 @@ class EpisodeStage:
 
     def _panel(self, chosen: int) -> None:
         gui = self.server.gui
-        gui.configure_theme(show_logo=False, show_share_button=False)
-        gui.main_panel.dock_right()
-        gui.set_panel_label("tdf view")
         with gui.add_folder("Episodes"):
             kinds = gui.add_dropdown("which", (ALL, SUCCESSES, FAILURES), initial_value=ALL)
             names = self._names(ALL)

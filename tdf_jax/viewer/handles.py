@@ -12,6 +12,7 @@ from tdf_jax.viz.style import COLOURS
 
 POINT, LINE = 0.0022, 0.0016  # metres: edge of a point, thickness of a line
 FIELD_OF_VIEW = 45.0  # degrees
+AMBIENT = 1.2  # light from everywhere, in viser's unit, so that no side is black
 CELL = 0.05  # metres, cells of the floor
 MOST_POINTS = 20_000  # of a cloud; more are thinned, and first paint stays quick
 
@@ -174,6 +175,10 @@ def look(server: Any, contents: Float[np.ndarray, "points 3"]) -> None:
     middle, size = (low + high) / 2, high - low
     distance = 0.58 * np.linalg.norm(size) / np.tan(np.radians(FIELD_OF_VIEW) / 2)
     server.scene.set_up_direction("+z")
+    # Reflections of surroundings take ten times as long where the processor draws, as on a remote desktop.
+    server.scene.configure_environment_map(None)
+    server.scene.configure_default_lights(True, cast_shadow=False)
+    server.scene.add_light_ambient("/light", intensity=AMBIENT)
     camera = server.initial_camera
     camera.position, camera.look_at = middle + distance * towards, middle
     camera.fov, camera.near = np.radians(FIELD_OF_VIEW), 0.005

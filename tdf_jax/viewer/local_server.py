@@ -54,6 +54,9 @@ def serving(function: str, port: int = PORT) -> Iterator[Any]:
         ) from None
     with _quiet():
         server = viser.ViserServer(host=HOST, port=port, label="tdf view", verbose=False)
+    server.gui.configure_theme(show_logo=False, show_share_button=False)
+    server.gui.main_panel.dock_right()  # beside the scene, not over it
+    server.gui.set_panel_label("tdf view")
     try:
         yield server
     finally:

@@ -1,5 +1,6 @@
 """An imitation on the screen: what is shown, what the panel says, and what the mouse does."""
 
+import threading
 import time
 from typing import Any
 
@@ -27,6 +28,8 @@ BESIDE, OVER, HIDDEN = "beside", "over it", "hidden"
 BOX, SURFACE, PROBE = COLOURS(0.35), "#7aa6c2", "#f4845f"
 REACH = 0.006  # metres from the ray of a click within which a point is hit
 SHOWN_MODES = 12
+SURFACE_NAME = "reconstructed surface"
+PAINTING = 2.0  # seconds from a browser's connection to when it has painted
 GRIP = 0.5  # length of the arrows at the object, in its diagonal
 
 
@@ -47,11 +50,25 @@ class Stage:
         self._draw()
         self._panel(landscape)
         self._show(self.found)
-        self.worker.ask("surface", self._add_surface)
+        self._waiting: threading.Timer | None = None
+        server.on_client_connect(lambda _: self._seen())
+
+    def prepare(self) -> None:
+        """Compile what a drag needs, so that the first answers as fast as the others."""
         self.worker.ask("prepare", self._prepare)
+
+    def _seen(self) -> None:
+        """Prepare once the first browser has painted: compilation would take the processor from it."""
+        with self.player.lock:
+            if self._waiting is None:
+                self._waiting = threading.Timer(PAINTING, self.prepare)
+                self._waiting.daemon = True
+                self._waiting.start()
 
     def close(self) -> None:
         """Stop what runs beside the server."""
+        if self._waiting is not None:
+            self._waiting.cancel()
         self.player.stop()
         self.worker.close()
 
@@ -165,17 +182,16 @@ class Stage:
         try:
             triangles = solving.reconstructed(self.problem)
         except InputError as error:  # libigl is an extra
-            self._surface_box.hint = str(error)
+            self._say(str(error))
             return
         if not len(triangles):
+            self._say("No point is inside: the surface is empty.")
             return
         node = handles.add_triangles(self.server, "/imitation/object/surface", triangles, SURFACE, 0.85)
         node.visible = self._surface_box.value
-        self._nodes["reconstructed surface"] = [node]
-        self._surface_box.disabled = False
+        self._nodes[SURFACE_NAME] = [node]
 
     def _prepare(self) -> None:
-        """Compile what a drag needs, so that the first answers as fast as the others."""
         last = self.found
         solving.dragged(self.problem, last.motion, last)
         solving.regoaled(self.problem, last.goal, last)
@@ -186,9 +202,6 @@ class Stage:
 
     def _panel(self, landscape: Landscape | None) -> None:
         gui, result = self.server.gui, self.problem.scene.result
-        gui.configure_theme(show_logo=False, show_share_button=False)
-        gui.main_panel.dock_right()  # beside the scene, not over it
-        gui.set_panel_label("tdf view")
         self._summary = gui.add_markdown("")
         self._status = gui.add_markdown("Preparing the solver ...")
         with gui.add_folder("Time"):
@@ -216,8 +229,8 @@ class Stage:
             for name, nodes in self._nodes.items():
                 if any(node is not None for node in nodes):
                     self._add_switch(name, name != "cloud" or not any(self._nodes["mesh"]))
-            self._surface_box = gui.add_checkbox("reconstructed surface", False, disabled=True)
-            self._surface_box.on_update(lambda event: self._set_visible("reconstructed surface", event.target.value))
+            self._surface_box = gui.add_checkbox(SURFACE_NAME, False, hint="It takes some seconds the first time")
+            self._surface_box.on_update(lambda event: self._show_surface(event.target.value))
             where = gui.add_dropdown("demonstration", (BESIDE, OVER, HIDDEN), initial_value=BESIDE)
         where.on_update(lambda event: self._put_demonstration(event.target.value))
         self._put_demonstration(BESIDE)
@@ -233,6 +246,11 @@ class Stage:
         for node in self._nodes.get(name, ()):
             if node is not None:
                 node.visible = value
+
+    def _show_surface(self, value: bool) -> None:
+        if value and SURFACE_NAME not in self._nodes:
+            self.worker.ask("surface", self._add_surface)
+        self._set_visible(SURFACE_NAME, value)
 
     def _put_demonstration(self, where: str) -> None:
         self._shown.visible = where != HIDDEN

@@ -791,3 +791,13 @@ def test_commands_are_the_functions_of_their_modules():
     }
     for name in command_line.COMMANDS:
         assert callable(getattr(sys.modules[f"tdf_jax.cli.{name}"], name))
+
+
+def test_a_film_inside_the_folder_of_results_is_refused(tmp_path, capsys):
+    """The folder is replaced as a whole by the next run, and nothing else in it is the command's to replace."""
+    out = tmp_path / "out"
+    with pytest.raises(SystemExit) as stop:
+        run("imitate", "--out", out, "--animation", out / "films" / "film.gif")
+    error = capsys.readouterr().err
+    assert stop.value.code == 2 and "expected a file beside it" in error and f"in --out {out}" in error
+    assert not list(tmp_path.iterdir())

@@ -1,5 +1,6 @@
 """The viewer: what it shows and does without a browser, and with one, by a mouse."""
 
+import threading
 import time
 
 import jax
@@ -30,6 +31,7 @@ def problem(demonstration, small_model):
 def shown(problem):
     with serving("test", 0) as server:
         one = stage.Stage(server, problem)
+        one.prepare()
         assert one.worker.wait(SECONDS)
         yield one
         one.close()
@@ -41,6 +43,7 @@ def test_what_is_placed_on_a_target_is_dragged_as_well(placed_scene, small_model
     with serving("test", 0) as server:
         shown = stage.Stage(server, problem)
         try:
+            shown.prepare()
             assert shown.worker.wait(SECONDS)
             assert shown._status.content.startswith("Ready")
             count = placed_scene.result.trajectories.shape[1]
@@ -128,6 +131,46 @@ def test_the_point_that_is_clicked_is_that_of_the_held_object(shown, problem):
     turn = Rotation.from_quat(shown._probe.wxyz, scalar_first=True)
     middle = turn.apply(np.asarray(problem.reference.query).mean(axis=0)) + shown._probe.position
     np.testing.assert_allclose(middle, problem.points[7], atol=1e-6)
+
+
+def test_the_reconstructed_surface_is_computed_when_it_is_asked_for(shown, monkeypatch):
+    triangles = np.random.default_rng(0).normal(size=(7, 3, 3))
+    monkeypatch.setattr(solving, "reconstructed", lambda problem: triangles)
+    name = "/imitation/object/surface"
+    assert name not in shown.server.scene._handle_from_node_name
+    shown._show_surface(True)
+    assert shown.worker.wait(SECONDS)
+    node = shown.server.scene._handle_from_node_name[name]
+    assert len(node.faces) == 7
+    monkeypatch.setattr(solving, "reconstructed", lambda problem: pytest.fail("it is computed again"))
+    shown._show_surface(False)
+    assert not node.visible
+    shown._show_surface(True)
+    assert shown.worker.wait(SECONDS) and node.visible
+
+
+def test_a_surface_that_cannot_be_computed_is_said(shown, monkeypatch):
+    def missing(problem):
+        raise tdf.InputError("libigl is not installed")
+
+    monkeypatch.setattr(solving, "reconstructed", missing)
+    shown._show_surface(True)
+    assert shown.worker.wait(SECONDS) and shown._status.content == "libigl is not installed"
+
+
+def test_the_solver_is_prepared_once_the_first_browser_has_painted(problem, monkeypatch):
+    """Not before, when it would take the processor from the browser, and once for all browsers."""
+    monkeypatch.setattr(stage, "PAINTING", 0.0)
+    asked, begun = [], threading.Event()
+    monkeypatch.setattr(stage.Stage, "prepare", lambda self: asked.append(1) or begun.set())
+    with serving("test", 0) as server:
+        one = stage.Stage(server, problem)
+        assert not asked
+        for _ in range(2):
+            one._seen()
+        assert begun.wait(SECONDS)
+        one.close()
+    assert len(asked) == 1
 
 
 def test_a_hand_on_the_slider_stops_the_player(shown):
