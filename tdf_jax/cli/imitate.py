@@ -420,7 +420,11 @@ def _modes(config, result) -> list[dict] | None:
 def _solutions(modes: list[dict]) -> str:
     """How many distinct picks there are, and how far behind the second is."""
     words = f"{len(modes)} distinct pick{'s' if len(modes) != 1 else ''}"
-    return words if len(modes) < 2 else f"{words}; the second's loss is {modes[1]['energy']:.5f}"
+    if len(modes) < 2:
+        return words
+    best, second = (mode["energy"] for mode in modes[:2])
+    higher = f", {second / best - 1:.0%} higher".replace("%", " %") if best > 0 else ""
+    return f"{words}; the second's loss is {second:.5f}{higher}"
 
 
 def _plain_settings(settings: dict) -> dict:

@@ -801,3 +801,10 @@ def test_a_film_inside_the_folder_of_results_is_refused(tmp_path, capsys):
     error = capsys.readouterr().err
     assert stop.value.code == 2 and "expected a file beside it" in error and f"in --out {out}" in error
     assert not list(tmp_path.iterdir())
+
+
+def test_the_table_says_how_much_worse_the_second_pick_is():
+    assert report._solutions([{"energy": 0.002}]) == "1 distinct pick"
+    words = report._solutions([{"energy": 0.002}, {"energy": 0.0025}, {"energy": 0.004}])
+    assert words == "3 distinct picks; the second's loss is 0.00250, 25 % higher"
+    assert report._solutions([{"energy": 0.0}, {"energy": 0.1}]) == "2 distinct picks; the second's loss is 0.10000"
