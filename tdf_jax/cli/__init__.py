@@ -3,6 +3,7 @@
 Modules:
     main: the commands, and errors as messages
     options: options that commands share
+    scenes: objects and demonstrations, read from files or generated
     camera: depth images, and the object that they show
     pictures: optional outputs, which may fail
     streams: standard output and error, which may fail

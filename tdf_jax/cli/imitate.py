@@ -18,8 +18,9 @@ from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file, replace_folder
 from tdf_jax.cli.camera import choose, read_scene, table as cluster_table
-from tdf_jax.cli.options import Settings, make_scene, resolved
+from tdf_jax.cli.options import Settings, resolved
 from tdf_jax.cli.pictures import Pictures, check_animation, check_page
+from tdf_jax.cli.scenes import make_scene
 from tdf_jax.cli.targets import imitate_targets
 from tdf_jax.cli.tasks import TaskScene, make_task, not_judged
 from tdf_jax.energy.losses import EnergyWeights

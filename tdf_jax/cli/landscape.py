@@ -18,8 +18,9 @@ from tqdm.auto import tqdm
 from tdf_jax._internal.cache import digest
 from tdf_jax._internal.errors import InputError
 from tdf_jax._internal.files import replace_file, replace_folder
-from tdf_jax.cli.options import LandscapeSettings, make_scene, resolved
+from tdf_jax.cli.options import LandscapeSettings, resolved
 from tdf_jax.cli.pictures import Pictures, check_page
+from tdf_jax.cli.scenes import make_scene
 from tdf_jax.energy.reference import Reference, describe
 from tdf_jax.evaluation.scene import Scene
 from tdf_jax.geometry import se3

@@ -13,10 +13,10 @@ import pytest
 from conftest import POSES, QUERIES, STARTS
 
 import tdf_jax as tdf
-from tdf_jax.cli import imitate as report, main as command_line, options as scene
+from tdf_jax.cli import imitate as report, main as command_line, scenes
 from tdf_jax.cli.main import main
 from tdf_jax.cli.options import Settings
-from tdf_jax.evaluation.cases import PLACE
+from tdf_jax.evaluation.cases import PLACE, generated_case
 from tdf_jax.evaluation.metrics import pose_error
 from tdf_jax.geometry.paths import PATHS
 from tdf_jax.io.demonstrations import save_demonstration
@@ -163,7 +163,7 @@ def test_the_truth_is_the_handle_and_the_goal(folder):
     record = record_of(folder)
     found = tdf.load_trajectory(folder / "trajectory.npz")
     expected = np.array(record["expected"], np.float32)
-    pair = scene.generated_case("mug", 0, 0, points=60)
+    pair = generated_case("mug", 0, 0, points=60)
     handle = tdf.Trajectory.from_matrices(np.stack([pair.T_world_place_b] * 2)).wxyz_xyz[0]
     metres, radians = pose_error(expected[0], handle)
     assert metres < 1e-5 and radians < 1e-3
@@ -182,7 +182,7 @@ def test_the_goal_is_the_demonstrations_carried_by_the_centroids_and_offset(imit
     plain = np.array(imitate(*TINY)["goal"])
     offset = np.array(imitate(*TINY, "--goal-offset", "-0.1", "0.2", "0.3")["goal"])
     np.testing.assert_allclose(offset - plain, [0, 0, 0, 0, -0.1, 0.2, 0.3], atol=1e-6)
-    model, pair = tdf.load_model(weights), scene.generated_case("mug", 0, 0, points=60)
+    model, pair = tdf.load_model(weights), generated_case("mug", 0, 0, points=60)
     origins = [tdf.encode(model, tdf.thin(points, 40)).origin for points in (pair.points_a, pair.points_b)]
     place = pair.T_world_place_a[:3, 3] + PLACE - origins[0] + origins[1]
     np.testing.assert_allclose(plain, [1, 0, 0, 0, *place], atol=1e-5)
@@ -268,7 +268,7 @@ def test_scale_and_pose_of_an_own_target(tmp_path):
     settings = Settings(
         target=tmp_path / "cloud.npy", category="mug", scale=0.1, target_pose="random", num_poses=3, queries=4
     )
-    made = scene.make_scene(dataclasses.replace(settings, trajectory="line"), jax.random.key(0))
+    made = scenes.make_scene(dataclasses.replace(settings, trajectory="line"), jax.random.key(0))
     T = made.T_world_target
     np.testing.assert_allclose(made.points, 0.1 * cloud @ T[:3, :3].T + T[:3, 3], atol=1e-6)
     assert np.linalg.norm(T - np.eye(4)) > 0.1
@@ -279,7 +279,7 @@ def test_a_drawn_mesh_lies_where_its_points_do(tmp_path):
     path = mesh_file(tmp_path, "stl")
     settings = Settings(target=path, category="mug", target_pose="random", trajectory="line", num_poses=2, queries=4)
     for one in (settings, dataclasses.replace(settings, target=None)):
-        made = scene.make_scene(one, jax.random.key(0))
+        made = scenes.make_scene(one, jax.random.key(0))
         for points, mesh in zip((made.demonstration.points, made.points), made.meshes):
             assert (points >= mesh.bounds[0] - 1e-6).all() and (points <= mesh.bounds[1] + 1e-6).all()
 
@@ -293,7 +293,7 @@ def test_every_path_can_be_named():
 @pytest.mark.parametrize("shape", PATHS)
 def test_generated_demonstrations_go_from_the_handle_to_the_place(shape):
     settings = Settings(category="mug", trajectory=shape, num_poses=5, queries=7, target_pose="given")
-    made = scene.make_scene(settings, jax.random.key(0))
+    made = scenes.make_scene(settings, jax.random.key(0))
     shown, (handle_a, handle_b) = made.demonstration, made.T_world_places
     ends = shown.trajectory.matrices
     np.testing.assert_allclose(ends[0], handle_a, atol=1e-6)

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
-from tdf_jax.cli import options
+from tdf_jax.cli import options, scenes
 from tdf_jax.cli.main import main
 from tdf_jax.cli.options import Settings, categories_of, resolved
 from tdf_jax.evaluation.annotated_meshes import AnnotatedMesh
@@ -199,7 +199,7 @@ def test_commands_name_the_families():
 )
 def test_a_scene_begins_at_the_categorys_place_and_ends_on_a_shelf(category):
     settings = resolved(Settings(category=category, queries=8, points=60, seed=3))
-    made = options.make_scene(settings, jax.random.key(0))
+    made = scenes.make_scene(settings, jax.random.key(0))
     ends = np.asarray(made.demonstration.trajectory.matrices)[[0, -1]]
     np.testing.assert_allclose(ends[0], made.T_world_places[0], atol=1e-6)
     assert ends[1, 2, 3] > ends[0, 2, 3] + 0.1
