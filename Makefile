@@ -39,12 +39,13 @@ $(VENV)/.venv:
 	$(PYTHON) -m venv $(VENV)
 	touch $@
 
-$(VENV)/.installed: $(VENV)/.venv pyproject.toml
+# installed again where the version changes, which is in the __init__.py of the package
+$(VENV)/.installed: $(VENV)/.venv pyproject.toml tdf_jax/__init__.py
 	$(BIN)/pip install --quiet --editable .
 	touch $@
 
 # .installed-NAME: with the extra NAME
-$(VENV)/.installed-%: $(VENV)/.venv pyproject.toml
+$(VENV)/.installed-%: $(VENV)/.venv pyproject.toml tdf_jax/__init__.py
 	$(BIN)/pip install --quiet --editable '.[$*]'
 	touch $(VENV)/.installed $@
 
