@@ -159,6 +159,7 @@ def test_gradients(run, assumed):
     assert names["pull"].shape == assumed["new"].shape and np.abs(names["pull"]).max() > 0
 
 
+@pytest.mark.slow
 def test_devices_and_batches(run, assumed, monkeypatch):
     joined = []
     monkeypatch.setattr(jax.distributed, "initialize", lambda *where, **which: joined.append((where, which)))
