@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 WIDTH = 7.2  # width of a page's text, inches
 SHOWN_POINTS = 1500  # points of a cloud; more points overlap at the width of a page
 VIEW = {"elev": 22.0, "azim": -38.0}  # the handle faces the reader, and the path runs to the right
-TICKS, LABEL = 4, -3.5  # intervals between ticks on the longest axis, and points between ticks and the axis's name
+TICKS, LABEL = 4, -1.2  # intervals between ticks on the longest axis, and points between ticks and the axis's name
 MARGIN = 1.06  # length of the axes, in that of their contents
 MOST_TRIANGLES = 40_000  # a mesh with more triangles is drawn as points, because matplotlib would take seconds
 

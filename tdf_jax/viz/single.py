@@ -40,7 +40,7 @@ def axes3d(function: str, ax: Any | None) -> tuple[Figure, Axes3D]:
     """
     if ax is None:
         figure = blank_figure(*SIZE)
-        return figure, add_axes3d(figure, (0.02, 0.14, 0.9, 0.82))
+        return figure, add_axes3d(figure, (0.02, 0.16, 0.9, 0.82))
     if getattr(ax, "name", None) != "3d":
         raise InputError(
             f"{function}: ax is {type(ax).__name__}; expected three-dimensional axes, as of "
@@ -188,7 +188,7 @@ def _legend(ax: Axes3D, without: str | None = None) -> None:
     if legend:
         place = {
             "loc": "upper center",
-            "bbox_to_anchor": (0.5, -0.06),
+            "bbox_to_anchor": (0.5, -0.085),
             "frameon": False,
             "fontsize": 7,
             "markerscale": 2,
