@@ -139,6 +139,7 @@ from tdf_jax.solvers.imitation_scene import (
 from tdf_jax.solvers.multistart import SolveConfig as SolveConfig, solve as solve
 from tdf_jax.solvers.pick import CarryConfig as CarryConfig, carry as carry
 from tdf_jax.solvers.result import Result as Result
+from tdf_jax.solvers.sensitivity import differentiable_pick as differentiable_pick
 from tdf_jax.solvers.tracking import TrackConfig as TrackConfig, track as track
 from tdf_jax.uncertainty.calibration import (
     confidence as confidence,
@@ -180,6 +181,7 @@ __all__ = [
     "describe",
     "descriptor_loss",
     "DescriptorField",
+    "differentiable_pick",
     "displace",
     "drop_invalid",
     "encode",

@@ -161,6 +161,9 @@ CALLS = {
     "describe": lambda w: tdf.describe(w.model, [w.demonstration, w.demonstration], combine="median"),
     "descriptor_loss": lambda w: tdf.descriptor_loss(w.path, w.field, w.reference),
     "displace": lambda w: tdf.displace(w.path, (0, 0, 1)),
+    "differentiable_pick": lambda w: (lambda found: (dataclasses.astuple(found), found.status))(
+        tdf.differentiable_pick(w.field, w.reference, w.pose)
+    ),
     "drop_invalid": lambda w: tdf.drop_invalid(w.shown),
     "encode": lambda w: tdf.encode(w.model, w.cloud),
     "energy_landscape": lambda w: tdf.energy_landscape(w.field, w.reference, w.grid).values,
@@ -384,6 +387,10 @@ PURE = {
         "shown",
     ),
     "descriptor_loss": (lambda w, x: tdf.descriptor_loss(tdf.Trajectory(x), w.field, w.reference), "poses"),
+    "differentiable_pick": (
+        lambda w, x: tdf.differentiable_pick(w.field, dataclasses.replace(w.reference, query=x), w.pose).pose,
+        "query",
+    ),
     "displace": (lambda w, x: tdf.displace(w.path, x), "vector"),
     "encode": (lambda w, x: tdf.encode(w.model, x).latent, "shown"),
     "gaussian_query": (lambda w, x: tdf.gaussian_query(KEY, 4, centre=x), "vector"),

@@ -30,6 +30,7 @@ Modules:
     relation_success: gap, penetration, orientation and support of a placed object
     relation_tasks: an object and a target that fit, the true placement, a demonstration
     scene: a demonstration and a target in one world
+    sensitivity_study: derivatives of picks beside picks that are found again
     statistics: success thresholds and bootstrap intervals
     tabletop: clouds of an object on a table, from depth images, and with foreign points
     tables: tables as Markdown and as text

@@ -8,6 +8,7 @@ Modules:
     multistart: `solve`: Gauss-Newton from many starts in stages
     pick: `carry`: finds the pick and warps the demonstration from there to the goal
     result: result of any solver
+    sensitivity: `differentiable_pick`: derivatives of a found pick
     stages: sizes and candidates of the stages of `solve`
     tracking: `track`: the pick on an object that moved, from the last pick
 """
