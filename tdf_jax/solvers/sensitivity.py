@@ -29,12 +29,14 @@ from tdf_jax.solvers.initial import check_channels
 # Directions whose curvature is below this share of the stiffest one's are free, as in `pose_covariance`.
 FREE = 0.03
 SCALE = 0.03  # metres per radian, of query points in a box of 6 cm, where they all coincide
-LARGEST_OFFSET = 2e-3  # metres; farther from the minimum a pick is not what a solver would find
+# Radians; times the rotation_scale 2 mm with query points in a box of 6 cm. Farther from the minimum a pick is not what
+# a solver would find.
+LARGEST_OFFSET = 0.07
 
 
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=["pose", "directions", "curvatures", "num_free", "offset"],
+    data_fields=["pose", "directions", "curvatures", "num_free", "offset", "rotation_scale"],
     meta_fields=[],
 )
 @dataclasses.dataclass(frozen=True)
@@ -51,6 +53,7 @@ class DifferentiablePick:
             of a bowl: their curvature is below 3 % of the largest. The derivatives have no part along them.
         offset: length of the next step towards the minimum of the energy, metres; a rotation counts as the distance by
             which it moves the query points. Free directions do not count.
+        rotation_scale: root mean square distance of the query points from their centroid, metres per radian.
     """
 
     pose: Float[Array, "7"]
@@ -58,6 +61,7 @@ class DifferentiablePick:
     curvatures: Float[Array, "6"]
     num_free: Int[Array, ""]
     offset: Float[Array, ""]
+    rotation_scale: Float[Array, ""]
 
     @property
     @public
@@ -73,7 +77,7 @@ class DifferentiablePick:
                 "num_free and offset"
             )
         free, offset = int(self.num_free), float(self.offset)
-        if not offset <= LARGEST_OFFSET:
+        if not offset <= LARGEST_OFFSET * float(self.rotation_scale):
             return (
                 f"the pick is {1e3 * offset:.1f} mm from the minimum of the energy, of which the derivatives are: find "
                 "it by tdf.carry"
@@ -130,9 +134,9 @@ def _implicit(field, query, demonstrated, pick, model):
 
 @_implicit.defjvp
 def _implicit_jvp(primals, tangents):
-    *energy, pick, model = primals
-    changes = jax.jvp(lambda *energy: _residual(*energy, pick), energy, tangents[:3])[1]
-    step = -model.inverse @ jnp.einsum("qac,qc->a", model.weighted, changes)
+    pick, model = primals[3:]
+    changes = jax.jvp(lambda *energy: _residual(*energy, pick), primals[:3], tangents[:3])[1]
+    step = -model.solved(changes)
     # The rotation w moves the quaternion q by (0, w) q / 2, and the pose's origin about the centroid.
     w, v = step[:3], step[3:] * model.scale
     real, imaginary, origin = pick[0], pick[1:4], pick[4:]
@@ -144,17 +148,24 @@ class _Model(NamedTuple):
     """The weighted squares at a pick.
 
     Attributes:
-        inverse: inverse of the Hessian without its free directions, (6, 6), with respect to a rotation, radians, and a
-            translation, in units of the scale.
+        axes: principal axes of the Hessian in columns, (6, 6), of a rotation, radians, and a translation, in units of
+            the scale.
+        flexibilities: inverses of the curvatures along them, (6,); zero along free directions.
         weighted: the weighted Jacobian, (queries, 6, channels).
         centroid: centroid of the query points, (3,), metres, world frame.
         scale: root mean square distance of the query points from it, metres per radian.
     """
 
-    inverse: Float[Array, "6 6"]
+    axes: Float[Array, "6 6"]
+    flexibilities: Float[Array, "6"]
     weighted: Float[Array, "queries 6 channels"]
     centroid: Float[Array, "3"]
     scale: Float[Array, ""]
+
+    def solved(self, differences: Float[Array, "queries channels"]) -> Float[Array, "6"]:
+        """The inverse of the Hessian times the gradient that belongs to differences of descriptors."""
+        gradient = jnp.einsum("qac,qc->a", self.weighted, differences)
+        return self.axes @ (self.flexibilities * (self.axes.T @ gradient))
 
 
 def _residual(field, query, demonstrated, pick):
@@ -162,7 +173,7 @@ def _residual(field, query, demonstrated, pick):
 
 
 def _model(field, query, demonstrated, pick):
-    """The model, and the status of its derivatives: directions, curvatures, number of free ones, offset."""
+    """The model, and the status of its derivatives: directions, curvatures, number of free ones, offset, scale."""
     centre = jnp.mean(query, axis=0)
     arm = se3.rotate(se3.rotation(pick), query - centre)
     scale = jnp.sqrt(jnp.mean(jnp.sum(arm**2, axis=-1)))
@@ -182,9 +193,9 @@ def _model(field, query, demonstrated, pick):
     weighted = jacobian / jnp.maximum(jnp.maximum(size, jnp.mean(size, axis=-1, keepdims=True)), 1e-9)[:, None]
     curvatures, axes = jnp.linalg.eigh(jnp.einsum("qac,qbc->ab", weighted, jacobian))
     determined = curvatures > FREE * curvatures[-1]
-    inverse = (axes * jnp.where(determined, 1 / jnp.where(determined, curvatures, 1.0), 0.0)) @ axes.T
-    offset = scale * jnp.linalg.norm(inverse @ jnp.einsum("qac,qc->a", weighted, residual))
+    flexibilities = jnp.where(determined, 1 / jnp.where(determined, curvatures, 1.0), 0.0)
+    model = _Model(axes, flexibilities, weighted, se3.transform(pick, centre[None])[0], scale)
     directions = jnp.concatenate([axes[:3], axes[3:] * scale]).T
     shares = curvatures / jnp.where(curvatures[-1] > 0, curvatures[-1], 1.0)
-    model = _Model(inverse, weighted, se3.transform(pick, centre[None])[0], scale)
-    return model, (directions, shares, jnp.sum(~determined), offset)
+    offset = scale * jnp.linalg.norm(model.solved(residual))
+    return model, (directions, shares, jnp.sum(~determined), offset, scale)
