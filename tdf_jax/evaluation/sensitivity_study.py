@@ -5,7 +5,8 @@ compute them. The same pick is found again in float64 after a finite change both
 those of one farthest-point subsample; of the latent; of the query points with their descriptors held; and of the box of
 query points, which is then described again on the demonstrated object. Half the difference, divided by the step, is
 what the derivative is compared with, as twists of six numbers in which a rotation counts as the distance by which it
-moves the query points. Free directions are projected out of both. What is measured is kept in a folder, so that an
+moves the query points. Free directions are projected out of the derivatives, and held where picks are found again:
+along them a pick may slide far, as about the axis of a bowl. What is measured is kept in a folder, so that an
 interrupted run goes on.
 
     python -m tdf_jax.evaluation.sensitivity_study --pairs 20 --seed 7711 --out derivatives
@@ -21,6 +22,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.optimize
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from tqdm.auto import tqdm
@@ -28,7 +30,7 @@ from tqdm.auto import tqdm
 from tdf_jax._internal.cache import kept
 from tdf_jax._internal.errors import InputError, TdfWarning
 from tdf_jax.energy.descriptors import pose_descriptor
-from tdf_jax.energy.losses import EnergyWeights
+from tdf_jax.energy.losses import waypoint_loss
 from tdf_jax.energy.reference import Reference
 from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, SEED_SPACE, generated_case, place_demonstration
 from tdf_jax.evaluation.tables import markdown, percent
@@ -41,8 +43,7 @@ from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.field import DescriptorField
 from tdf_jax.networks.model import Model, fingerprint
 from tdf_jax.networks.occupancy import condition
-from tdf_jax.solvers import gauss_newton
-from tdf_jax.solvers.pick import CarryConfig, carry
+from tdf_jax.solvers.pick import carry
 from tdf_jax.solvers.sensitivity import differentiable_pick
 
 FORMAT = 1  # format number; raise it when the pairs or what is measured change
@@ -57,9 +58,7 @@ CHANGES = {
 }
 # Changes that are made again by a third of the step, which says whether the pick moves in proportion.
 REPEATED = ("box moved",)
-# A minimum is looked for, be it the right one or not.
-SEARCH = CarryConfig(num_starts=16, num_candidates=1)
-STEPS, TOLERANCE, DAMPING = 60, 1e-9, 1e-3  # of the solver that finds picks again, which ends within a micrometre
+TOLERANCE = 1e-6  # metres, of picks that are found again
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,22 +137,41 @@ def _scene(model: Model, category: str, seed: int, number: int) -> _Scene:
     case = generated_case(category, seed, number)
     query = box_query(jax.random.key(seed), QUERIES, QUERY_SIZE * case.scale)
     demo = place_demonstration(case, "line", 2, query)
-    clouds = [thin(np.asarray(cloud), model.info.cloud_points) for cloud in (demo.points, case.points_b)]
+    clouds = [thin(np.asarray(cloud), model.info.cloud_points or len(cloud)) for cloud in (demo.points, case.points_b)]
     fields = [encode(model, cloud, 0, clean=False) for cloud in clouds]
     rng = np.random.default_rng([SEED_SPACE, seed, number, 13])
     axis, towards = rng.normal(size=3), rng.normal(size=fields[1].latent.shape)
     towards *= np.linalg.norm(fields[1].latent) / np.linalg.norm(towards)
-    arrays = *clouds, query, demo.trajectory.wxyz_xyz[0], axis / np.linalg.norm(axis), towards
-    return _Scene(model, *(np.asarray(part, np.float32) for part in arrays), *fields)
+    return _Scene(
+        model=model,
+        points_a=clouds[0],
+        points_b=clouds[1],
+        query=np.asarray(query),
+        pick=np.asarray(demo.trajectory.wxyz_xyz[0]),
+        axis=(axis / np.linalg.norm(axis)).astype(np.float32),
+        towards=towards.astype(np.float32),
+        field_a=fields[0],
+        field=fields[1],
+    )
 
 
 def _in_float64(scene: _Scene) -> _Scene:
     """The same pair; the caller enables float64."""
-    model, *arrays = scene[:7]
-    params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), model.params)
-    model = dataclasses.replace(model, params=params)
-    arrays = [part.astype(np.float64) for part in arrays]
-    return _Scene(model, *arrays, *(encode(model, cloud, 0, clean=False) for cloud in arrays[:2]))
+    params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), scene.model.params)
+    model = dataclasses.replace(scene.model, params=params)
+    clouds = [cloud.astype(np.float64) for cloud in (scene.points_a, scene.points_b)]
+    fields = [encode(model, cloud, 0, clean=False) for cloud in clouds]
+    return _Scene(
+        model=model,
+        points_a=clouds[0],
+        points_b=clouds[1],
+        query=scene.query.astype(np.float64),
+        pick=scene.pick.astype(np.float64),
+        axis=scene.axis.astype(np.float64),
+        towards=scene.towards.astype(np.float64),
+        field_a=fields[0],
+        field=fields[1],
+    )
 
 
 def measure(model: Model, category: str, seed: int, number: int) -> Pair:
@@ -171,7 +189,7 @@ def measure(model: Model, category: str, seed: int, number: int) -> Pair:
         centre = scene.query.mean(axis=0, dtype=float)
         scale = np.sqrt(((scene.query - centre) ** 2).sum(axis=1).mean())
         field, reference = scene.changed("", 0.0)
-        pick = carry(field, reference, jax.random.key(number), fix_last=False, config=SEARCH).pick
+        pick = carry(field, reference, jax.random.key(number), fix_last=False).pick
         status = differentiable_pick(field, reference, pick)
         predicted = [
             jax.jvp(
@@ -181,18 +199,30 @@ def measure(model: Model, category: str, seed: int, number: int) -> Pair:
             )
             for change in CHANGES
         ]
+        axes = np.asarray(status.directions, float) * ([1.0] * 3 + [1 / scale] * 3)
+        free, determined = np.split(axes, [int(status.num_free)])
+        softness = 1 / np.sqrt(np.asarray(status.curvatures, float)[len(free) :])
+        # Twists of steps that raise the energy about equally.
+        steps = softness[:, None] * determined
         with jax.enable_x64(True):
             scene = _in_float64(scene)
-            base = _found(pick, *scene.changed("", 0.0))
-            found = [_secant(scene, change, base, centre, scale) for change in CHANGES]
-            again = [
-                _secant(scene, change, base, centre, scale, 1 / 3) if change in REPEATED else np.zeros(6)
-                for change in CHANGES
-            ]
-    free = np.asarray(status.directions, float)[: int(status.num_free)] * ([1.0] * 3 + [1 / scale] * 3)
+            base = _found(np.asarray(pick, float), *scene.changed("", 0.0), steps, scale)
+
+            def secant(change, share=1.0):
+                step = share * CHANGES[change]
+                plus, minus = (
+                    _twist(base, _found(base, *scene.changed(change, sign * step), steps, scale), centre, scale)
+                    for sign in (1.0, -1.0)
+                )
+                return (plus - minus) / (2 * step)
+
+            found = [secant(change) for change in CHANGES]
+            again = [secant(change, 1 / 3) if change in REPEATED else np.zeros(6) for change in CHANGES]
     return Pair(
         category=category,
-        predicted=np.array([_velocity(*map(np.asarray, pair), centre, scale) for pair in predicted]),
+        predicted=np.array(
+            [_velocity(np.asarray(pose), np.asarray(change), centre, scale) for pose, change in predicted]
+        ),
         found=np.array(found),
         again=np.array(again),
         free=free,
@@ -201,29 +231,33 @@ def measure(model: Model, category: str, seed: int, number: int) -> Pair:
 
 
 @jax.jit
-def _solved(pick, field, reference):
-    count = len(reference.query)
-    problem = gauss_newton.in_blocks(reference, np.arange(count)[None], np.ones((1, count), bool))
-    bounds = np.array([1, 1, 1, STEPS], np.int32)
-    R, centroid, _ = gauss_newton.descend(
-        se3.rotation(pick)[None], se3.transform(pick, problem.centre[None]), jnp.zeros(1, jnp.int32), bounds,
-        jnp.asarray(DAMPING, pick.dtype), jnp.asarray(TOLERANCE, pick.dtype), field, problem,
-        jax.tree.map(lambda weight: jnp.asarray(weight, pick.dtype), EnergyWeights(0.0)),
-        length=STEPS + 1, chunk=count,
-    )  # fmt: skip
-    return se3.pose(R, centroid - se3.rotate(R, problem.centre[None])[:, 0])[0]
+def _energy(amounts, pick, steps, scale, field, reference):
+    """The energy after steps from a pick, and its gradient."""
+
+    def energy(amounts):
+        twist, centre = amounts @ steps, jnp.mean(reference.query, axis=0)
+        R = se3.multiply(se3.exp(twist[None, :3] / scale), se3.rotation(pick)[None])[0]
+        centroid = se3.transform(pick, centre[None])[0] + twist[3:]
+        pose = se3.pose(R, centroid - se3.rotate(R, centre[None])[0])
+        return waypoint_loss(R, se3.translation(pose), field, reference.query, reference.descriptors[0]), pose
+
+    (value, pose), slope = jax.value_and_grad(energy, has_aux=True)(amounts)
+    return value, slope, pose
 
 
-def _found(pick, field: DescriptorField, reference: Reference) -> Float[np.ndarray, "7"]:
-    """The minimum near a pick, in float64."""
-    return np.asarray(_solved(jnp.asarray(pick, jnp.float64), field, reference))
+def _found(pick, field: DescriptorField, reference: Reference, steps, scale: float) -> Float[np.ndarray, "7"]:
+    """The minimum near a pick along some directions, in float64, by BFGS (Nocedal and Wright, 2006, chapter 6)."""
 
+    def energy(amounts):
+        value, slope, _ = _energy(amounts, pick, steps, scale, field, reference)
+        return float(value) / unit, np.asarray(slope) / unit
 
-def _secant(scene: _Scene, change: str, base, centre, scale: float, share: float = 1.0) -> Float[np.ndarray, "6"]:
-    """Motion of the pick over a change both ways by a share of its step, for a change of 1."""
-    step = share * CHANGES[change]
-    ends = [_found(base, *scene.changed(change, sign * step)) for sign in (1.0, -1.0)]
-    return (_twist(base, ends[0], centre, scale) - _twist(base, ends[1], centre, scale)) / (2 * step)
+    # Steps of a centimetre and their rise make the numbers of the minimiser about one.
+    steps, unit, start = 0.01 * steps, 1.0, np.zeros(len(steps))
+    unit = energy(start)[0]
+    options = {"gtol": TOLERANCE / 0.01, "maxiter": 100}
+    amounts = scipy.optimize.minimize(energy, start, jac=True, method="BFGS", options=options).x
+    return np.asarray(_energy(amounts, pick, steps, scale, field, reference)[2])
 
 
 def _twist(begin, end, centre, scale: float) -> Float[np.ndarray, "6"]:
@@ -270,6 +304,12 @@ def report(pairs: Sequence[Pair]) -> str:
     )
 
 
+def _pair(arrays: dict[str, np.ndarray]) -> Pair:
+    """What is kept of a pair."""
+    measured = (arrays[name] for name in ("predicted", "found", "again", "free"))
+    return Pair(str(arrays["category"]), *measured, offset=float(arrays["offset"]))
+
+
 def _spread(errors: Sequence[float]) -> list[str]:
     return [percent(float(value)) for value in np.percentile(errors, (50, 90, 100))]
 
@@ -302,10 +342,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 lambda category=category, number=number: dataclasses.asdict(
                     measure(models[category], category, settings.seed, number)
                 ),
-                lambda arrays: Pair(
-                    **{field.name: arrays[field.name] for field in dataclasses.fields(Pair)}
-                    | {"category": arrays["category"].item(), "offset": arrays["offset"].item()}
-                ),
+                _pair,
             )
             pairs.append(pair)
     except (InputError, OSError) as error:

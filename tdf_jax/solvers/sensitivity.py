@@ -123,7 +123,7 @@ def differentiable_pick(
 @full_precision
 def _differentiable(field, query, demonstrated, pick):
     model, status = _model(*jax.lax.stop_gradient((field, query, demonstrated)), pick)
-    return DifferentiablePick(_implicit(field, query, demonstrated, pick, model), *status)
+    return dataclasses.replace(status, pose=_implicit(field, query, demonstrated, pick, model))
 
 
 @jax.custom_jvp
@@ -135,7 +135,7 @@ def _implicit(field, query, demonstrated, pick, model):
 @_implicit.defjvp
 def _implicit_jvp(primals, tangents):
     pick, model = primals[3:]
-    changes = jax.jvp(lambda *energy: _residual(*energy, pick), primals[:3], tangents[:3])[1]
+    changes = jax.jvp(functools.partial(_residual, pick), primals[:3], tangents[:3])[1]
     step = -model.solved(changes)
     # The rotation w moves the quaternion q by (0, w) q / 2, and the pose's origin about the centroid.
     w, v = step[:3], step[3:] * model.scale
@@ -168,12 +168,12 @@ class _Model(NamedTuple):
         return self.axes @ (self.flexibilities * (self.axes.T @ gradient))
 
 
-def _residual(field, query, demonstrated, pick):
+def _residual(pick, field, query, demonstrated):
     return field.descriptors(se3.transform(pick, query)) - demonstrated
 
 
 def _model(field, query, demonstrated, pick):
-    """The model, and the status of its derivatives: directions, curvatures, number of free ones, offset, scale."""
+    """The model, and the pick with the status of its derivatives."""
     centre = jnp.mean(query, axis=0)
     arm = se3.rotate(se3.rotation(pick), query - centre)
     scale = jnp.sqrt(jnp.mean(jnp.sum(arm**2, axis=-1)))
@@ -198,4 +198,4 @@ def _model(field, query, demonstrated, pick):
     directions = jnp.concatenate([axes[:3], axes[3:] * scale]).T
     shares = curvatures / jnp.where(curvatures[-1] > 0, curvatures[-1], 1.0)
     offset = scale * jnp.linalg.norm(model.solved(residual))
-    return model, (directions, shares, jnp.sum(~determined), offset, scale)
+    return model, DifferentiablePick(pick, directions, shares, jnp.sum(~determined), offset, scale)
