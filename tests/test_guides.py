@@ -157,6 +157,8 @@ def test_gradients(run, assumed):
     )
     assert names["value"] < first
     assert names["pull"].shape == assumed["new"].shape and np.abs(names["pull"]).max() > 0
+    assert np.abs(names["change"][4:]).max() > 0  # the pick on a larger object
+    assert names["found"].status
 
 
 @pytest.mark.slow
