@@ -204,8 +204,9 @@ def _failures(rows: Sequence[Row]) -> str:
     return (
         "Each failed episode has one cause ([what they mean](../guide/simulation.md#causes-of-failure)); a mug that "
         "hangs, but not by its handle, is among them. The movement in the hand after closing is a median over all "
-        "episodes with a grasp. Starts out of reach and pairs that do not fit were drawn again before any method "
-        "ran.\n\n" + markdown(heads, cells)
+        "episodes with a grasp. Starts out of reach were drawn again before any method ran, and so were pairs that do "
+        "not fit or of which no start is within reach: objects that the arm reaches from few starts are rarer here "
+        "than they are.\n\n" + markdown(heads, cells)
     )
 
 
@@ -227,15 +228,18 @@ def _times(rows: Sequence[Row], settings: Mapping[str, Any]) -> str:
     versions = ", ".join(f"{name} {about[name]}" for name in ("jax", "mujoco", "mink"))
     processes = settings.get("processes")
     shares = ""
+    # Both modes share what is imitated.
+    shared = {row.condition._replace(mode="", mass=0.0): row.seconds()[:, 0] for row in rows}
     spent = np.nansum(np.concatenate([row.seconds() for row in rows]), axis=0)
+    spent[0] = np.nansum(np.concatenate([*shared.values()]))
     if spent.sum() > 0:
         parts = ", ".join(f"{name} {percent(float(one / spent.sum()))}" for name, one in zip(report.PARTS, spent))
-        shares = f" Of all the time known here: {parts}."
+        shares = f" Of all the time known here, with each imitation counted once: {parts}."
     heads = ["task", "mode", *CONDITIONS, *report.PARTS, "all episodes, minutes"]
     return (
         "Median seconds of an episode in its process, compilation included where an episode compiles: imitation "
-        "(clouds, pick, goal), planning of the arm's motion, which teleport does not need, and physics. The last "
-        "column is the sum over all episodes, which several processes share. "
+        "(clouds, pick, goal), which both modes of an episode share, planning of the arm's motion, which teleport does "
+        "not need, and physics. The last column is the sum over all episodes, which several processes share. "
         f"{about['cores']} cores, {versions}, "
         f"{'a process for each core' if processes is None else f'processes: {processes}'}; times of earlier runs in "
         f"the same folder are theirs.{shares}\n\n" + markdown(heads, cells)

@@ -14,6 +14,7 @@ from tdf_jax.sim.necks import DEPTHS, LEVEL_STEP, neck_holds
 from tdf_jax.sim.pads import HALF_PAD, flush_turn, turned_about_x
 
 CLEARANCE = 0.018  # metres between each finger and the wall before closing
+LEAST_CLEARANCE = 0.002  # metres, where the fingers do not open so far
 RIM_DEPTH = 0.030  # metres from the rim down the wall to the tips of the fingers
 MOST_DEPTH = 0.6  # of the height of a low bowl
 DIRECTIONS, ROUND_TOLERANCE = (
@@ -76,6 +77,12 @@ def _rim_grip(shape: Shape, fingers: Fingers) -> Grip:
     T = np.eye(4)
     T[:3, :3] = np.stack([np.cross(across, down), across, down], axis=1)
     width = max(width, lower_width)
+    if width + 2 * LEAST_CLEARANCE > fingers.widest:
+        raise InputError(
+            f"grip_of(): the wall of the {shape.category} is {1e3 * width:.1f} mm thick, and the fingers open to "
+            f"{1e3 * fingers.widest:.1f} mm; expected {1e3 * LEAST_CLEARANCE:.0f} mm more on each side. Take a gripper "
+            "that opens wider"
+        )
     top = upper - down * (levels[0] / max(float(-down @ up), 0.5))
     tip = fingers.tip(width)
     T[:3, 3] = top + down * (depth - tip)

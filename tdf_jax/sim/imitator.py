@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from tdf_jax.sim.scans import Scan
     from tdf_jax.sim.workcell import Workcell
 
-FORMAT = 13  # format number; raise it when what is drawn or imitated changes
+FORMAT = 14  # format number; raise it when what is drawn or imitated changes
 FIRST_DEMONSTRATION = 1_000_000  # their numbers begin here, so that no episode shares their objects
 POINTS = 1500  # of a complete cloud
 VIEWED = 4000  # most points of a cloud of cameras: the field takes a subsample

@@ -1,6 +1,7 @@
 """Settings of the physics in one place, and the import of the engine, MuJoCo."""
 
 import importlib
+import os
 import warnings
 from types import ModuleType
 from typing import Any
@@ -34,7 +35,7 @@ def extra(function: str, name: str) -> ModuleType:
         The module.
 
     Raises:
-        InputError: it is not installed.
+        InputError: it is not installed, or MuJoCo cannot be imported with the MUJOCO_GL that is set.
     """
     try:
         return importlib.import_module(name)
@@ -42,6 +43,14 @@ def extra(function: str, name: str) -> ModuleType:
         package = PACKAGES.get(name.split(".")[0], name)
         raise InputError(
             f"{function}: {package} is not installed ({error}); install the extra: pip install 'tdf_jax[sim]'"
+        ) from None
+    except Exception as error:  # a renderer that MUJOCO_GL names is loaded with MuJoCo, and raises errors of many kinds
+        wanted = os.environ.get("MUJOCO_GL")
+        if not wanted:
+            raise
+        raise InputError(
+            f"{function}: MuJoCo cannot be imported with MUJOCO_GL={wanted} ({type(error).__name__}: {error}); "
+            "expected egl, osmesa or glfw whose library is installed. Unset MUJOCO_GL to let tdf_jax choose"
         ) from None
 
 

@@ -130,7 +130,9 @@ def summary(runs: Sequence[Run]) -> str:
     lines += [f"  failed: {cause}: {count}" for cause, count in causes(runs).items()]
     parts = seconds(used)
     rejected, redrawn = (sum(getattr(one, name) for one in runs) for name in ("rejected", "redrawn"))
-    lines.append(f"  drawn before: {rejected} starts out of reach, {redrawn} pairs that do not fit")
+    lines.append(
+        f"  drawn before: {rejected} starts out of reach, {redrawn} pairs that do not fit or have no start within reach"
+    )
     for words, values in (("median", np.median(parts, axis=0)), ("all episodes", parts.sum(axis=0))) if used else ():
         named = (f"{name} {_seconds(value)}" for name, value in zip(PARTS, values))
         lines.append(f"  seconds, {words}: {', '.join(named)}")

@@ -74,7 +74,7 @@ class Row:
         return float(slip), float(turn)
 
     def drawn(self) -> tuple[int, int]:
-        """Numbers of starts out of reach and of pairs that do not fit, drawn before the episodes."""
+        """Numbers of starts out of reach, and of pairs that do not fit or of which no start is within reach."""
         return sum(one.rejected for one in self.all), sum(one.redrawn for one in self.all)
 
     def seconds(self) -> Float[np.ndarray, "episodes 3"]:

@@ -37,7 +37,7 @@ def reading(rows: Sequence[Row]) -> list[str]:
         pairs = _pairs(ours, field, before, after)
         if pairs:
             masses = {(one.condition.mass, other.condition.mass) for one, other in pairs}
-            also = ", and objects of their natural mass" if any(a and not b for a, b in masses) else ""
+            also = ", and objects with masses by their volume" if any(a and not b for a, b in masses) else ""
             lines.append(f"- {words}{also}: overall success {_difference(pairs, field in SAME_EPISODES)}.")
     methods = dict.fromkeys(row.condition.method for row in rows if row.condition.method != LIBRARY)
     for method in methods:
@@ -66,8 +66,8 @@ def reading(rows: Sequence[Row]) -> list[str]:
         lines.append(f"- Rows of {few} episodes show that the command works, and little else.")
     general = (
         "Teleport tests the grasp and the placement apart, and nothing moves between them. An executed episode also "
-        "needs a posture of the arm at both ends, a way without collision, and an object that does not move in the "
-        "hand. Every drawn episode counts, also one for which no motion is found."
+        "needs a posture of the arm at both ends, a way without collision, and an object that stays in the hand; it "
+        "may move there, if it ends where it should. Every drawn episode counts, also one for which no motion is found."
     )
     return [general, "\n".join(lines)] if lines else [general]
 

@@ -182,6 +182,7 @@ def draw_episode(
     checks.choice("draw_episode()", "task", task, TASKS)
     checks.choice("draw_episode()", "poses", poses, POSES)
     rejected = redrawn = 0
+    unfit_for = None  # why the last pair did not fit the fingers or the target, if none was looked at for reach
     what = task if scan is None else f"{task} with {scan.name}"
     for other in range(MOST_PAIRS):
         try:
@@ -202,7 +203,7 @@ def draw_episode(
                     rejected,
                     redrawn,
                 ) from None
-            redrawn += 1
+            redrawn, unfit_for = redrawn + 1, str(error)
             continue
         rng = np.random.default_rng([SEED_SPACE, seed, number + other * OTHER_PAIRS, 7])
         bodies = {"object_body": _body(one), "target_body": body_of(target)}
@@ -231,6 +232,13 @@ def draw_episode(
                     return tried
             rejected += 1
         redrawn += 1
+    if not rejected and unfit_for:
+        raise NotDrawn(
+            f"draw_episode(): no {what} of episode {number} (seed {seed}) fits {robot.name} in {MOST_PAIRS} pairs: "
+            f"{unfit_for}; expected a gripper that spans the object",
+            rejected,
+            redrawn,
+        )
     raise NotDrawn(
         f"draw_episode(): no {what} of episode {number} (seed {seed}) is within reach of {robot.name} in {MOST_PAIRS} "
         f"pairs of {STARTS} starts each; expected a robot that reaches the table",

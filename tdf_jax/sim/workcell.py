@@ -29,14 +29,12 @@ class Workcell:
         model: the `mujoco.MjModel`.
         robot: the robot; None if there is none.
         floating: whether the gripper floats, driven by a frame, instead of being carried by the arm.
-        has_target: whether there is a target.
         fixed_target: whether the target is fixed to the world.
     """
 
     model: Any
     robot: Robot | None
     floating: bool
-    has_target: bool
     fixed_target: bool
 
     def data(self) -> Any:
@@ -185,7 +183,7 @@ def build_workcell(
         kind, bodies = mujoco.mjtEq.mjEQ_WELD, mujoco.mjtObj.mjOBJ_BODY
         hold = spec.add_equality(name=FIXTURE, type=kind, objtype=bodies, name1=FIXTURE, name2=OBJECT)
         hold.solref, hold.solimp, hold.data = SOLREF, (*SOLIMP, 0.5, 2.0), WELD
-    return Workcell(compiled(spec), robot, floating, target is not None, fixed_target)
+    return Workcell(compiled(spec), robot, floating, fixed_target)
 
 
 def _add_body(mujoco, spec, name: str, body: Body, T, free: bool) -> None:

@@ -1,6 +1,8 @@
 """`tdf simulate`: what it refuses at once, and what it writes."""
 
 import json
+import os
+import subprocess
 import sys
 
 import pytest
@@ -92,6 +94,22 @@ def test_a_film_that_nothing_here_renders_is_refused(refusal, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disable")
     error = refusal("--animation", "film.gif")
     assert "nothing renders off screen here (MUJOCO_GL is disable)" in error and "set MUJOCO_GL=egl" in error
+
+
+def test_a_renderer_that_does_not_exist_is_refused(tmp_path):
+    """It is loaded with MuJoCo, so in a process of its own."""
+    script = "import sys; from tdf_jax.cli.main import main; main(sys.argv[1:])"
+    words = ["simulate", "--task", "bowl_on_shelf", "--clouds", "full", "--episodes", "1"]
+    done = subprocess.run(
+        [sys.executable, "-c", script, *words],
+        env=os.environ | {"MUJOCO_GL": "nonsense"},
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+    )
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert "MuJoCo cannot be imported with MUJOCO_GL=nonsense" in done.stderr and "Unset MUJOCO_GL" in done.stderr
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_view_without_a_display_is_refused(refusal, monkeypatch):

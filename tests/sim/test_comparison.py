@@ -232,7 +232,7 @@ def test_the_reading_compares_rows_that_differ_in_one_thing(row):
     ]
     text = "\n".join(reading(rows))
     assert (  # whatever the masses
-        "Executed instead of teleported, and objects of their natural mass: overall success is lower by 25 points"
+        "Executed instead of teleported, and objects with masses by their volume: overall success is lower by 25 points"
     ) in text
     assert "instead of upright: overall success is lower by 50 points" in text
     assert "The library instead of ICP: overall success is higher by 100 points, 95 % interval +100 to +100" in text

@@ -106,3 +106,8 @@ def test_what_has_no_grasp_is_refused(robot):
     narrow = dataclasses.replace(robot.fingers, openings=robot.fingers.openings * 0.3)
     with pytest.raises(InputError, match=r"the neck of the bottle is wider than the gripper, 26 mm"):
         grip_of(tdf.build_bottle(), narrow)
+    thin = dataclasses.replace(robot.fingers, openings=robot.fingers.openings * 0.05)
+    with pytest.raises(
+        InputError, match=r"the wall of the mug is \d\.\d mm thick, and the fingers open to 4\.\d mm; exp"
+    ):
+        grip_of(tdf.build_mug(), thin)

@@ -123,6 +123,17 @@ def test_what_nothing_fits_around_is_drawn_again(robot, drawn, monkeypatch):
     assert episode.redrawn == 1 and len(calls) == 2 and calls[1] is episode.object
 
 
+def test_where_no_object_fits_the_gripper_it_is_said(robot, monkeypatch):
+    """Not that the arm does not reach, which was not looked at."""
+
+    def too_wide(shape, fingers):
+        raise InputError("grip_of(): too wide")
+
+    monkeypatch.setattr(tasks, "grip_of", too_wide)
+    with pytest.raises(tasks.NotDrawn, match=r"fits UR5e in 20 pairs: grip_of\(\): too wide; expected a gripper that"):
+        draw_episode("bowl_on_shelf", robot, 900, 0)
+
+
 @pytest.mark.slow
 def test_a_tilted_bottle_is_picked_in_the_plane_of_its_tilt(robot, drawn):
     episode = drawn("bottle_on_shelf", "tilt60")
