@@ -687,8 +687,10 @@ def test_true_picks_are_simulated_and_kept(tmp_path, capsys):
     record = json.loads((tmp_path / "simulation" / "simulation.json").read_text())
     assert [row["condition"]["mode"] for row in record["rows"]] == ["teleport", "execute"]
     assert all(row["rates"]["overall"]["rate"] == 1 for row in record["rows"])
-    kept = sorted((tmp_path / "runs").iterdir())
+    kept = sorted((tmp_path / "runs").glob("*.npz"))
     assert len(kept) == 3  # one imitation, and what became of it in each mode
+    kept += sorted((tmp_path / "runs" / "episodes").iterdir())
+    assert len(kept) == 6  # an episode to look at in each mode, and their robot
     times = [one.stat().st_mtime_ns for one in kept]
     page = (tmp_path / "simulation.md").read_bytes()
     run(*words, "--processes", 1, "--out", tmp_path)  # reads what is kept: the times too
