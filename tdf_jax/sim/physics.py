@@ -46,7 +46,7 @@ def extra(function: str, name: str) -> ModuleType:
         ) from None
     except Exception as error:  # a renderer that MUJOCO_GL names is loaded with MuJoCo, and raises errors of many kinds
         wanted = os.environ.get("MUJOCO_GL")
-        if not wanted:
+        if not wanted or name not in ("mujoco", "mink"):  # mink imports MuJoCo
             raise
         raise InputError(
             f"{function}: MuJoCo cannot be imported with MUJOCO_GL={wanted} ({type(error).__name__}: {error}); "
