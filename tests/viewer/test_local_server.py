@@ -1,5 +1,6 @@
 import socket
 import sys
+import urllib.request
 
 import pytest
 
@@ -20,8 +21,8 @@ def test_a_server_listens_on_this_machine_alone_and_stops(capsys):
         assert server.get_host() == HOST == "127.0.0.1"
         port = server.get_port()
         assert address(server) == f"http://127.0.0.1:{port}" and port > 0
-        with socket.create_connection((HOST, port), 5):
-            pass
+        with urllib.request.urlopen(address(server), timeout=5) as page:
+            assert b"<html" in page.read()
         with pytest.raises(InputError, match=rf"port {port} cannot be used .*--port, or --port 0 for any"):
             with serving("tdf view", port):
                 pass
