@@ -57,6 +57,7 @@ def benchmark(
     light: bool = False,
     processes: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_CORES)] = None,
     page: bool = False,
+    playbacks: bool = True,
     object_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
     target_weights: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint=_CATEGORY)] = None,
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("benchmark"),
@@ -100,6 +101,8 @@ def benchmark(
         processes: number of processes of --simulation, on which the outcomes do not depend.
         page: write a page of the first failure of each cause of --simulation, to turn and play in a browser without a
             network, in the folder runs/failures; needs the extra "pages".
+        playbacks: keep the motion of every episode of --simulation in the folder runs/episodes, 80 kB each, which
+            `tdf view` and --page play.
         object_weights: weights of the object of --relations.
         target_weights: weights of the target of --relations.
         out: folder for the page; its folder runs keeps the computed attempts.
@@ -112,7 +115,7 @@ def benchmark(
     from tdf_jax.evaluation.path_methods import METHODS
     from tdf_jax.evaluation.path_report import page as report, record, sections
     from tdf_jax.evaluation.path_scores import run, score
-    from tdf_jax.evaluation.records import write_record
+    from tdf_jax.evaluation.records import folder_name, write_record
     from tdf_jax.geometry.winding import libigl
     from tdf_jax.networks.checkpoint import load_model
 
@@ -133,7 +136,7 @@ def benchmark(
             "--targets": (targets is not None, (simulated,)), "--masks": (masks != ("segmented",), (simulated,)),
             "--episodes": (episodes != 100, (simulated,)),
             "--light": (light, (simulated,)), "--processes": (processes is not None, (simulated,)),
-            "--page": (page, (simulated,)),
+            "--page": (page, (simulated,)), "--no-playbacks": (not playbacks, (simulated,)),
         },
     )  # fmt: skip
     if simulation:
@@ -145,10 +148,11 @@ def benchmark(
                 "tasks": _given(tasks, typing.get_args(Task)), "modes": modes, "targets": targets,
                 "pose": _given(pose, ("upright", "tilt60")), "clouds": clouds, "methods": _given(methods, ("tdf_jax",)),
                 "demonstrations": demonstrations or (1,), "light": light, "masks": masks, "episodes": episodes,
-                "seed": seed, "processes": processes, "meshes": None if meshes is None else str(meshes),
+                "seed": seed, "processes": processes, "meshes": meshes,
                 "recursive": recursive, "num_poses": num_poses,
             },
             page,
+            playbacks,
         )  # fmt: skip
     methods = _given(methods, ("all",))
     if relations:
@@ -190,7 +194,7 @@ def benchmark(
         )
     settings = {
         "weights": weights, "pairs": pairs, "seed": seed, "height": height, "clouds": clouds, "methods": methods,
-        "num_starts": num_starts, "meshes": None if meshes is None else str(meshes), "recursive": recursive,
+        "num_starts": num_starts, "meshes": folder_name(meshes), "recursive": recursive,
         "num_poses": num_poses, "demonstrations": demonstrations,
     }  # fmt: skip
     picks = count_errors(makers, model, demonstrations, folder, seed=seed)

@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tdf_jax._internal.errors import InputError
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -15,13 +17,14 @@ PAGE, FOLDER, RECORD = "simulation.md", "simulation", "simulation.json"
 FAILURES, SHEET = "failures", "failures.png"  # folder of pictures, and all in one
 
 
-def measure(out: Path, settings: dict[str, Any], pages: bool = False) -> None:
+def measure(out: Path, settings: dict[str, Any], pages: bool = False, playbacks: bool = True) -> None:
     """Run all rows, or read what was kept of them, and write the page and the record.
 
     Args:
         out: folder of the page; its folder runs keeps the outcomes.
         settings: options of the command by name.
         pages: whether to write a page of the first failure of each cause as well.
+        playbacks: whether to keep the motion of every episode, which pages need.
 
     Raises:
         InputError: an option is wrong, the extra "sim" is not installed, or the folder cannot be written.
@@ -29,11 +32,10 @@ def measure(out: Path, settings: dict[str, Any], pages: bool = False) -> None:
     from tqdm.auto import tqdm
 
     from tdf_jax._internal import checks
-    from tdf_jax._internal.errors import InputError
     from tdf_jax._internal.files import replace_file
     from tdf_jax.cli.attempts import RUNS, attempts_folder
     from tdf_jax.cli.pictures import check_page
-    from tdf_jax.evaluation.records import write_record
+    from tdf_jax.evaluation.records import folder_name, write_record
     from tdf_jax.networks.checkpoint import available_models
     from tdf_jax.sim.campaign import run_campaign
     from tdf_jax.sim.comparison import page, record
@@ -44,6 +46,7 @@ def measure(out: Path, settings: dict[str, Any], pages: bool = False) -> None:
     from tdf_jax.sim.tasks import TASKS
 
     function = "tdf benchmark --simulation"
+    check_playbacks(function, pages, playbacks)
     if pages:
         check_page(function)
     checks.count(function, "--episodes", settings["episodes"], 1 if settings["meshes"] is None else 0)
@@ -64,14 +67,14 @@ def measure(out: Path, settings: dict[str, Any], pages: bool = False) -> None:
     conditions = planned_rows(*(settings[name] for name in names), objects=objects, masks=settings["masks"])
     for module in EXTRAS:
         extra(function, module)
-    campaigns = []
+    campaigns, folder = [], settings["meshes"]
     for condition in conditions:
         task = TASKS[condition.task]
         target_weights = task.target if task.target in available_models() else None  # of a board there are none
-        meshes = Path(str(settings["meshes"])).resolve() if condition.objects == MESHES else None
+        meshes = folder.resolve() if folder is not None and condition.objects == MESHES else None
         campaign = Settings(
             condition, task.object, target_weights, settings["seed"], (out / RUNS).resolve(), None, None,
-            meshes, settings["recursive"] and meshes is not None,
+            meshes, settings["recursive"] and meshes is not None, playbacks,
         )  # fmt: skip
         check_settings(campaign)
         count = settings["num_poses"] * len(load_objects(campaign)) if meshes else settings["episodes"]
@@ -86,6 +89,7 @@ def measure(out: Path, settings: dict[str, Any], pages: bool = False) -> None:
             f"{condition.objects} objects"
         )
         rows.append(Row(campaign, list(run_campaign(campaign, count, settings["processes"]))))
+    settings = {**settings, "meshes": folder_name(folder)}
     write_record(function, out / FOLDER / RECORD, record(rows, settings), indent=None)
 
     def write(sheet=None):
@@ -93,10 +97,24 @@ def measure(out: Path, settings: dict[str, Any], pages: bool = False) -> None:
 
     write()  # before pictures, which may fail
     print(out / PAGE)
-    folder = kept / FAILURES
-    if draw_failures(function, [(row.settings, row.all) for row in rows], folder, pages):
-        replace_file(function, out / FOLDER / SHEET, (folder / SHEET).read_bytes())
+    pictures = kept / FAILURES
+    if draw_failures(function, [(row.settings, row.all) for row in rows], pictures, pages):
+        replace_file(function, out / FOLDER / SHEET, (pictures / SHEET).read_bytes())
         write(f"{FOLDER}/{SHEET}")
+
+
+def check_playbacks(function: str, pages: bool, playbacks: bool) -> None:
+    """Raise InputError if pages are to be written of motions that are not kept.
+
+    Args:
+        function: begins the message.
+        pages: whether pages of episodes are to be written.
+        playbacks: whether the motion of every episode is kept.
+    """
+    if pages and not playbacks:
+        raise InputError(
+            f"{function}: --page plays what --no-playbacks leaves out; expected one of them; drop the other"
+        )
 
 
 def draw_failures(
@@ -120,7 +138,6 @@ def draw_failures(
     """
     import sys
 
-    from tdf_jax._internal.errors import InputError
     from tdf_jax._internal.files import replace_file
     from tdf_jax.cli.pictures import Pictures
     from tdf_jax.sim.failures import check_renderer, failure_sheet, first_failures, picture_failures
@@ -159,7 +176,6 @@ def write_episode_page(function: str, settings: "Settings", number: int, path: P
         path: the page; its folder is made if it does not exist.
         pictures: notes it as missing if it cannot be drawn or written.
     """
-    from tdf_jax._internal.errors import InputError
     from tdf_jax.sim.campaign import about_episode
     from tdf_jax.sim.playback import kept_episode, load_playback
     from tdf_jax.sim.playback_page import save_playback_page
@@ -167,7 +183,10 @@ def write_episode_page(function: str, settings: "Settings", number: int, path: P
     with pictures.drawing(path):
         kept = kept_episode(function, settings.folder, about_episode(settings, number))
         if kept is None:
-            raise InputError(f"episode {number} was run before episodes were kept; expected another --out")
+            raise InputError(
+                f"episode {number} is not kept to look at: it ran with --no-playbacks, or by an older tdf_jax; "
+                "expected another --out"
+            )
         path.parent.mkdir(parents=True, exist_ok=True)
         save_playback_page(path, load_playback(function, kept))
 

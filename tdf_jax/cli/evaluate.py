@@ -91,7 +91,7 @@ def evaluate(
     from tdf_jax.evaluation.annotated_meshes import load_annotated
     from tdf_jax.evaluation.cases import generated_case, mesh_case
     from tdf_jax.evaluation.pick_transfer import BASELINES, compare
-    from tdf_jax.evaluation.records import write_record
+    from tdf_jax.evaluation.records import folder_name, write_record
     from tdf_jax.geometry.winding import libigl
     from tdf_jax.networks.checkpoint import load_model
     from tdf_jax.solvers.adam import OptimizeConfig
@@ -106,7 +106,7 @@ def evaluate(
     config = OptimizeConfig(num_starts=num_starts, iterations=iterations)
     settings = {
         "weights": weights, "category": categories, "pairs": pairs, "seed": seed, "size": size, "place": place,
-        "num_starts": num_starts, "iterations": iterations, "meshes": None if meshes is None else str(meshes),
+        "num_starts": num_starts, "iterations": iterations, "meshes": folder_name(meshes),
         "recursive": recursive, "num_poses": num_poses, "clouds": clouds,
         "clutter": clutter, "stand": stand, "solver": solver,
     }  # fmt: skip

@@ -34,6 +34,7 @@ def simulate(
     view: bool = False,
     animation: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=_NONE)] = None,
     page: bool = False,
+    playbacks: bool = True,
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint=_NONE)] = None,
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("simulation"),
 ) -> None:
@@ -75,6 +76,8 @@ def simulate(
         animation: film of the first episode, a .gif or .mp4 file; only of executed ones.
         page: write episode.html, the first episode to turn and play in a browser without a network, and such a page of
             the first failure of each cause in the folder failures; needs the extra "pages".
+        playbacks: keep the motion of every episode in the folder episodes of --out, 80 kB each, which `tdf view` and
+            --page play.
         json: file for all outcomes.
         out: folder that keeps the outcomes between runs.
     """
@@ -82,7 +85,7 @@ def simulate(
 
     from tdf_jax._internal import checks
     from tdf_jax._internal.errors import InputError
-    from tdf_jax.cli.episodes import FAILURES, SHEET, draw_failures, write_episode_page
+    from tdf_jax.cli.episodes import FAILURES, SHEET, check_playbacks, draw_failures, write_episode_page
     from tdf_jax.cli.pictures import Pictures, check_page
     from tdf_jax.evaluation.records import write_record
     from tdf_jax.networks.checkpoint import load_model
@@ -107,6 +110,7 @@ def simulate(
         raise InputError(
             f"tdf simulate: --animation is {animation}; expected a name that ends in {' or '.join(ENDINGS)}"
         )
+    check_playbacks("tdf simulate", page, playbacks)
     for name, path in (("json", json), ("animation", animation)):  # not after hours
         if path is not None and (path.is_dir() or not path.parent.is_dir()):
             raise InputError(f"tdf simulate: --{name} is {path}; expected a file in an existing folder")
@@ -141,8 +145,9 @@ def simulate(
     if target_weights is None:
         target_weights = _shipped(TASKS[task].target)
     settings = Settings(
-        condition, object_weights or TASKS[task].object, target_weights, seed, out, robot, site, meshes, recursive
-    )
+        condition, object_weights or TASKS[task].object, target_weights, seed, out, robot, site, meshes, recursive,
+        playbacks,
+    )  # fmt: skip
     check_settings(settings)
     load_robot(robot, site)
     for weights in (settings.object_weights, target_weights):

@@ -32,6 +32,7 @@ Modules:
     scene: a demonstration and a target in one world
     sensitivity_study: derivatives of picks beside picks that are found again
     statistics: success thresholds and bootstrap intervals
+    study_command: the command line that studies have in common
     tabletop: clouds of an object on a table, from depth images, and with foreign points
     tables: tables as Markdown and as text
     tracking_study: picks on objects that moved, tracked and found anew

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from tdf_jax.evaluation.study_command import at_least
 from tdf_jax.geometry.distance_fields import box_obstacle
 from tdf_jax.geometry.paths import SHAPES
 from tdf_jax.geometry.query import gripper_query
@@ -58,10 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m tdf_jax.evaluation.clearance_study", description=(__doc__ or "").splitlines()[0]
     )
-    parser.add_argument("--scenes", type=int, default=50, help="number of scenes (default: 50)")
+    parser.add_argument("--scenes", type=at_least(1), default=50, help="number of scenes (default: 50)")
     count = parser.parse_args(arguments).scenes
-    if count < 1:
-        parser.error(f"--scenes is {count}; expected at least 1")
     body = gripper_query(jax.random.key(0), 300)
     rows = []
     for seed in range(count):

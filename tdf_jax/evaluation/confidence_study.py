@@ -7,7 +7,6 @@ truth. What is measured is kept in a folder, so that an interrupted run goes on.
     python -m tdf_jax.evaluation.confidence_study --weights mug --place handle --picks 1000 --seed 0 --out picks
 """
 
-import argparse
 import json
 import warnings
 from collections.abc import Sequence
@@ -24,6 +23,7 @@ from tdf_jax._internal.errors import InputError, TdfWarning
 from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, Case, generated_case
 from tdf_jax.evaluation.pick_transfer import place_errors, place_reference
 from tdf_jax.evaluation.statistics import SUCCESS
+from tdf_jax.evaluation.study_command import study_parser
 from tdf_jax.evaluation.tables import markdown, percent
 from tdf_jax.evaluation.tabletop import SEEN_POINTS
 from tdf_jax.geometry.query import box_query
@@ -138,19 +138,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: words of the command line; by default those of the process.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m tdf_jax.evaluation.confidence_study", description=(__doc__ or "").splitlines()[0]
+    parser = study_parser(
+        "tdf_jax.evaluation.confidence_study", __doc__, "picks", 1000, "number of picks", "the objects"
     )
     parser.add_argument("--weights", default="mug", help="name or file of the weights (default: mug)")
     parser.add_argument("--category", choices=sorted(FAMILIES), help="category (default: the name of the weights)")
     parser.add_argument("--place", help="frame of the category (default: where demonstrations pick)")
-    parser.add_argument("--picks", type=int, default=1000, help="number of picks (default: 1000)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the objects (default: 0)")
     parser.add_argument("--fit", action="store_true", help="fit a curve to these picks, and print its reliability too")
     parser.add_argument("--out", type=Path, required=True, help="folder that keeps the picks")
     settings = parser.parse_args(arguments)
-    if settings.picks < 1 or settings.seed < 0:
-        parser.error("--picks must be at least 1, and --seed at least 0")
     category = settings.category or settings.weights
     if category not in FAMILIES:
         parser.error(f"--category is not given, and {category!r} is none; expected one of {', '.join(FAMILIES)}")

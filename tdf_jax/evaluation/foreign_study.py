@@ -6,13 +6,11 @@ The rows of one seed have the same mugs, demonstrations and poses.
     python -m tdf_jax.evaluation.foreign_study --pairs 24 --seed 0
 """
 
-import argparse
 import dataclasses
 import json
 import sys
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple, cast
 
 import jax
@@ -27,6 +25,7 @@ from tdf_jax.evaluation import view_study
 from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, SEED_SPACE, Case, generated_case, size_of
 from tdf_jax.evaluation.pick_transfer import place_errors, place_reference
 from tdf_jax.evaluation.statistics import FINE, SUCCESS
+from tdf_jax.evaluation.study_command import file_to_write, study_parser
 from tdf_jax.evaluation.tables import markdown
 from tdf_jax.evaluation.tabletop import build_tabletop, moved
 from tdf_jax.geometry.query import box_query
@@ -204,18 +203,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: words of the command line; by default those of the process.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m tdf_jax.evaluation.foreign_study", description=(__doc__ or "").splitlines()[0]
+    parser = study_parser(
+        "tdf_jax.evaluation.foreign_study", __doc__, "pairs", 24, "number of pairs of every row", "the pairs"
     )
-    parser.add_argument("--pairs", type=int, default=24, help="number of pairs of every row (default: 24)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the pairs (default: 0)")
     parser.add_argument("--rows", nargs="+", choices=ROWS, default=ROWS, help="kinds of foreign points (default: all)")
-    parser.add_argument("--out", type=Path, help="file for the numbers of every pick (default: none)")
+    parser.add_argument("--out", type=file_to_write, help="file for the numbers of every pick (default: none)")
     settings = parser.parse_args(arguments)
-    if settings.pairs < 1 or settings.seed < 0:
-        parser.error("--pairs must be at least 1, and --seed at least 0")
-    if settings.out is not None and not settings.out.parent.is_dir():  # said before the work, not after it
-        parser.error(f"--out is {settings.out}; expected a file in an existing folder")
     model = load_model("mug")
     query = box_query(jax.random.key(settings.seed), QUERIES, QUERY_SIZE)
     picks: list[Pick] = []

@@ -18,7 +18,6 @@ import functools
 import json
 import warnings
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -31,6 +30,7 @@ from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, generated_case, place_
 from tdf_jax.evaluation.records import header, write_record
 from tdf_jax.evaluation.relation_scores import DEMONSTRATIONS, FIRST_DEMONSTRATION
 from tdf_jax.evaluation.relation_tasks import RELATIONS, demonstrate, draw_pair
+from tdf_jax.evaluation.study_command import at_least, file_to_write
 from tdf_jax.geometry.query import box_query
 from tdf_jax.imitation import imitate
 from tdf_jax.networks.checkpoint import load_model
@@ -203,17 +203,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--task", choices=list(RELATIONS), help="recognise the targets of a relation; the weights are those of the task"
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the cases")
-    parser.add_argument("--count", type=int, default=100, help="right cases, and as many wrong ones, of each category")
+    parser.add_argument("--seed", type=at_least(0), default=0, help="seed of the cases")
+    parser.add_argument(
+        "--count", type=at_least(1), default=100, help="right cases, and as many wrong ones, of each category"
+    )
     parser.add_argument(
         "--fit", action="store_true", help="fit the curve to these cases, instead of evaluating that of the weights"
     )
-    parser.add_argument("--out", type=Path, help="JSON file for the record")
+    parser.add_argument("--out", type=file_to_write, help="JSON file for the record")
     options = parser.parse_args(arguments)
-    if options.count < 1 or options.seed < 0:
-        parser.error("--count must be at least 1, and --seed at least 0")
-    if options.out is not None and not options.out.parent.is_dir():  # said before the work, not after it
-        parser.error(f"--out is {options.out}; expected a file in an existing folder")
     if options.task is not None and (options.weights is not None or options.category is not None):
         parser.error("--task has weights and categories of its own; drop --weights and --category")
     if options.task is None:

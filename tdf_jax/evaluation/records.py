@@ -34,6 +34,15 @@ def header(settings: Mapping[str, Any], model: Model) -> dict[str, Any]:
     }
 
 
+def folder_name(folder: Path | None) -> str | None:
+    """Name of a folder without the path to it, which says something of the user's machine and nothing of the result.
+
+    Args:
+        folder: the folder; None if there is none.
+    """
+    return None if folder is None else folder.resolve().name
+
+
 def write_record(function: str, path: Path, record: Mapping[str, Any], indent: int | None = 1) -> None:
     """Write a record; the file appears only once it is complete.
 

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from tdf_jax.energy.seating import touch_distance
 from tdf_jax.evaluation.relation_success import signed_distances
 from tdf_jax.evaluation.relation_tasks import POSES, RELATIONS, Placement, demonstrate, draw_pair, place_pair
+from tdf_jax.evaluation.study_command import at_least
 from tdf_jax.evaluation.tabletop import moved
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
@@ -209,10 +210,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prog="python -m tdf_jax.evaluation.relation_study", description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument("part", choices=("touch", "paths"), help="what is measured")
-    parser.add_argument("--pairs", type=int, default=20, help="number of pairs of each row (default: 20)")
+    parser.add_argument("--pairs", type=at_least(1), default=20, help="number of pairs of each row (default: 20)")
     settings = parser.parse_args(arguments)
-    if settings.pairs < 1:
-        parser.error(f"--pairs is {settings.pairs}; expected at least 1")
     if settings.part == "touch":
         bowl, mug = load_model("bowl"), load_model("mug")
         rows = [("bowl_on_mug", bowl, mug, clouds) for clouds in ("full", "views4", "views1")]

@@ -12,7 +12,6 @@ interrupted run goes on.
     python -m tdf_jax.evaluation.sensitivity_study --pairs 20 --seed 7711 --out derivatives
 """
 
-import argparse
 import dataclasses
 import warnings
 from collections.abc import Sequence
@@ -33,6 +32,7 @@ from tdf_jax.energy.descriptors import pose_descriptor
 from tdf_jax.energy.losses import waypoint_loss
 from tdf_jax.energy.reference import Reference
 from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, SEED_SPACE, generated_case, place_demonstration
+from tdf_jax.evaluation.study_command import study_parser
 from tdf_jax.evaluation.tables import markdown, percent
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.query import box_query
@@ -320,15 +320,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: words of the command line; by default those of the process.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m tdf_jax.evaluation.sensitivity_study", description=(__doc__ or "").splitlines()[0]
-    )
-    parser.add_argument("--pairs", type=int, default=20, help="number of pairs (default: 20)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the pairs (default: 0)")
+    parser = study_parser("tdf_jax.evaluation.sensitivity_study", __doc__, "pairs", 20, "number of pairs", "the pairs")
     parser.add_argument("--out", type=Path, required=True, help="folder that keeps what is measured")
     settings = parser.parse_args(arguments)
-    if settings.pairs < 1 or settings.seed < 0:
-        parser.error("--pairs must be at least 1, and --seed at least 0")
     try:
         settings.out.mkdir(parents=True, exist_ok=True)
         models = {category: load_model(category) for category in CATEGORIES[: settings.pairs]}

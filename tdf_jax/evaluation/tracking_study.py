@@ -7,7 +7,6 @@ symmetry of the object. What is measured is kept in a folder, so that an interru
     python -m tdf_jax.evaluation.tracking_study --moves 100 --seed 3625 --out moves
 """
 
-import argparse
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -26,6 +25,7 @@ from tdf_jax.energy.reference import describe
 from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, SEED_SPACE, Case, generated_case, place_demonstration
 from tdf_jax.evaluation.conditions import CONDITIONS, observed
 from tdf_jax.evaluation.metrics import nearest_place
+from tdf_jax.evaluation.study_command import study_parser
 from tdf_jax.evaluation.tables import markdown
 from tdf_jax.evaluation.tabletop import moved
 from tdf_jax.geometry.query import box_query
@@ -193,18 +193,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: words of the command line; by default those of the process.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m tdf_jax.evaluation.tracking_study", description=(__doc__ or "").splitlines()[0]
+    parser = study_parser(
+        "tdf_jax.evaluation.tracking_study", __doc__, "moves", 100, "number of moves", "the objects and motions"
     )
-    parser.add_argument("--moves", type=int, default=100, help="number of moves (default: 100)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the objects and motions (default: 0)")
     parser.add_argument("--angle", type=float, default=30.0, help="largest angle, degrees (default: 30)")
     parser.add_argument("--distance", type=float, default=0.05, help="largest distance, metres (default: 0.05)")
     parser.add_argument("--clouds", choices=CONDITIONS, default="full", help="condition of the clouds (default: full)")
     parser.add_argument("--out", type=Path, required=True, help="folder that keeps what is measured")
     settings = parser.parse_args(arguments)
-    if settings.moves < 1 or settings.seed < 0:
-        parser.error("--moves must be at least 1, and --seed at least 0")
     if not 0 <= settings.angle <= 180 or not 0 <= settings.distance < np.inf:
         parser.error("--angle must be from 0 to 180, and --distance at least 0")
     config = TrackConfig()

@@ -6,11 +6,9 @@ points are on the handle. The second view is from `tdf_jax.uncertainty.advice.lo
     python -m tdf_jax.evaluation.view_study --mugs 100 --seed 0
 """
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple, cast
 
 import jax
@@ -23,6 +21,7 @@ from tdf_jax._internal.files import replace_file
 from tdf_jax.energy.reference import Reference, describe
 from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, SEED_SPACE
 from tdf_jax.evaluation.statistics import SUCCESS, bootstrap_interval
+from tdf_jax.evaluation.study_command import file_to_write, study_parser
 from tdf_jax.evaluation.tables import between, percent
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
@@ -153,17 +152,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: words of the command line; by default those of the process.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m tdf_jax.evaluation.view_study", description=(__doc__ or "").splitlines()[0]
+    parser = study_parser(
+        "tdf_jax.evaluation.view_study",
+        __doc__,
+        "mugs",
+        100,
+        "number of mugs with a hidden handle",
+        "the mugs and cameras",
     )
-    parser.add_argument("--mugs", type=int, default=100, help="number of mugs with a hidden handle (default: 100)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the mugs and cameras (default: 0)")
-    parser.add_argument("--out", type=Path, help="file for the numbers of every mug (default: none)")
+    parser.add_argument("--out", type=file_to_write, help="file for the numbers of every mug (default: none)")
     settings = parser.parse_args(arguments)
-    if settings.mugs < 1 or settings.seed < 0:
-        parser.error("--mugs must be at least 1, and --seed at least 0")
-    if settings.out is not None and not settings.out.parent.is_dir():  # said before the work, not after it
-        parser.error(f"--out is {settings.out}; expected a file in an existing folder")
     model = load_model("mug")
     reference = demonstrate(model, settings.seed)
     cases: list[Case] = []

@@ -212,9 +212,9 @@ def _run(imitator: Imitator, number: int, view: bool = False) -> dict:
         outcome = teleport(episode, imitator.robot, pick, found.motion, opening, watch=sampler.watch)
     seconds = (found.seconds, time.perf_counter() - began, planned - began)
     path = found.paths[0] if len(found.paths) else np.zeros((0, 4, 4))
-    about = _described(imitator.settings, number, instance, outcome)
-    name = _file_name(imitator, number)
-    save_playback("tdf simulate", imitator.settings.folder / FOLDER, name, sampler.playback(about, found.points, path))
+    if imitator.settings.playbacks:
+        playback = sampler.playback(_described(imitator.settings, number, instance, outcome), found.points, path)
+        save_playback("tdf simulate", imitator.settings.folder / FOLDER, _file_name(imitator, number), playback)
     return {
         **dataclasses.asdict(outcome),
         "rejected": episode.rejected,

@@ -67,6 +67,7 @@ class Settings:
         meshes: folder of the objects with a meshes.json, for a condition of "meshes"; episode n has mesh n, modulo
             their number. See `tdf_jax.evaluation.annotated_meshes`.
         recursive: read the meshes in subfolders too.
+        playbacks: keep the motion of every episode in the folder too, to look at; outcomes do not depend on it.
     """
 
     condition: Condition
@@ -78,6 +79,7 @@ class Settings:
     site: str | None = None
     meshes: Path | None = None
     recursive: bool = False
+    playbacks: bool = True
 
 
 def check_condition(condition: Condition) -> None:

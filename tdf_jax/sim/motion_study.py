@@ -2,14 +2,13 @@
 
 A task is reachable if the arm has postures without collision at the pick and at the release, by a search of its own:
 mink from random starts, where the planner has its own damped least squares. Starts that are not reachable are
-drawn again, and every task that is drawn counts.
+drawn again, and every task that is drawn counts. A run that was interrupted computes what is missing.
 
-python -m tdf_jax.sim.motion_study --episodes 20
+python -m tdf_jax.sim.motion_study --episodes 20 --out runs/motions
 """
 
-import argparse
 import dataclasses
-import json
+import itertools
 import sys
 import time
 from collections.abc import Sequence
@@ -17,9 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
+from tdf_jax._internal.cache import digest, kept
 from tdf_jax._internal.errors import InputError
-from tdf_jax._internal.files import replace_file
 from tdf_jax.evaluation.statistics import bootstrap_interval
+from tdf_jax.evaluation.study_command import study_parser
 from tdf_jax.evaluation.tables import between, markdown, percent
 from tdf_jax.sim.collision import Collisions
 from tdf_jax.sim.episode import start_cell
@@ -29,6 +29,7 @@ from tdf_jax.sim.posture import HALF_TURN
 from tdf_jax.sim.robot import Robot, load_robot
 from tdf_jax.sim.tasks import POSES, TASKS, Episode, draw_episode, true_path
 
+FORMAT = 1  # format number; raise it when what is drawn or planned changes
 SEARCHES, ITERATIONS = 120, 40  # random starts at each end, and steps from each
 
 
@@ -134,36 +135,37 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: words of the command line; by default those of the process.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m tdf_jax.sim.motion_study", description=(__doc__ or "").splitlines()[0]
+    parser = study_parser(
+        "tdf_jax.sim.motion_study", __doc__, "episodes", 10, "number of tasks of each kind and start", "the tasks"
     )
-    parser.add_argument("--episodes", type=int, default=10, help="number of tasks of each kind and start (default: 10)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the tasks (default: 0)")
     parser.add_argument("--tasks", nargs="*", default=list(TASKS), choices=TASKS, help="tasks (default: all)")
     parser.add_argument("--poses", nargs="*", default=["upright", "tilt60"], choices=POSES, help="how objects start")
     parser.add_argument("--robot", type=Path, help="MJCF of another arm with a parallel gripper")
     parser.add_argument("--site", help="site of that file that is the gripper's frame")
-    parser.add_argument("--out", type=Path, help="file for the rows of all tasks (default: none)")
+    parser.add_argument("--out", type=Path, required=True, help="folder that keeps what is measured")
     settings = parser.parse_args(arguments)
-    if settings.episodes < 1 or settings.seed < 0:
-        parser.error("--episodes must be at least 1, and --seed at least 0")
-    if settings.out is not None and not settings.out.parent.is_dir():  # said before the work, not after it
-        parser.error(f"--out is {settings.out}; expected a file in an existing folder")
+    rows = []
     try:
-        robot, rows = load_robot(settings.robot, settings.site), []
-    except InputError as error:
-        parser.error(str(error))
-    for task in settings.tasks:
-        for poses in settings.poses:
+        robot = load_robot(settings.robot, settings.site)
+        settings.out.mkdir(parents=True, exist_ok=True)
+        file = None if settings.robot is None else [digest(settings.robot.read_bytes()), settings.site]
+        for task, poses in itertools.product(settings.tasks, settings.poses):
             for number in range(settings.episodes):
-                row = plan_task(robot, task, poses, settings.seed, number)
+                about = task, poses, settings.seed, number
+                row = kept(
+                    "motion_study",
+                    settings.out,
+                    ["motion", FORMAT, file, *about],
+                    lambda about=about: dataclasses.asdict(plan_task(robot, *about)),
+                    lambda arrays: Row(**{name: array.item() for name, array in arrays.items()}),
+                )
                 rows.append(row)
                 if not row.solved:
                     print(f"{task} {poses} {number}: {row.reason}", flush=True)
             print(f"{task} {poses}: {settings.episodes} tasks", file=sys.stderr, flush=True)
+    except (InputError, OSError) as error:
+        parser.error(str(error))
     print(table_of(rows))
-    if settings.out is not None:
-        replace_file("motion_study", settings.out, json.dumps([dataclasses.asdict(row) for row in rows]).encode())
 
 
 if __name__ == "__main__":

@@ -6,18 +6,17 @@ between two surfaces, with normal noise of 1 mm.
 python -m tdf_jax.sim.removal_study --objects 20
 """
 
-import argparse
 import dataclasses
 import json
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from tdf_jax._internal.files import replace_file
 from tdf_jax.evaluation.depth_images import four_rays
+from tdf_jax.evaluation.study_command import file_to_write, study_parser
 from tdf_jax.evaluation.tables import markdown
 from tdf_jax.evaluation.tabletop import rows_of
 from tdf_jax.perception.clusters import separate_objects
@@ -190,16 +189,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: words of the command line; by default those of the process.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m tdf_jax.sim.removal_study", description=(__doc__ or "").splitlines()[0]
+    parser = study_parser(
+        "tdf_jax.sim.removal_study", __doc__, "objects", 20, "number of objects of each row", "the objects and cameras"
     )
-    parser.add_argument("--objects", type=int, default=20, help="number of objects of each row (default: 20)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the objects and cameras (default: 0)")
     parser.add_argument("--rows", nargs="*", default=ROWS, choices=ROWS, help="rows (default: all)")
-    parser.add_argument("--out", type=Path, help="file for the numbers of every view (default: none)")
+    parser.add_argument("--out", type=file_to_write, help="file for the numbers of every view (default: none)")
     settings = parser.parse_args(arguments)
-    if settings.objects < 1 or settings.seed < 0:
-        parser.error("--objects must be at least 1, and --seed at least 0")
     table, record, names = [], {}, []
     for row in settings.rows:
         measured = []

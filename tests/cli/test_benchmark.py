@@ -200,9 +200,9 @@ def test_clouds_meshes_and_demonstrations_add_to_what_there_was(folder, everythi
     ]
     assert shared == before["tasks"]
     assert (everything / "demonstrations.png").read_bytes().startswith(PNG) and "demonstrations.png" in told(everything)
-    assert record["settings"]["meshes"] == str(real) and f"--meshes {real} --num-poses 2 --demonstrations 1 3" in told(
-        everything
-    )
+    assert record["settings"][
+        "meshes"
+    ] == real.name and f"--meshes {real.name} --num-poses 2 --demonstrations 1 3" in told(everything)
 
 
 @pytest.mark.slow
@@ -636,6 +636,19 @@ def test_rows_of_a_simulation_become_a_page_and_a_record(made_up, tmp_path, caps
     assert len(found["rows"]) == 12 and found["rows"][0]["causes"] == {"fell": 2}
     run(*words, "--out", tmp_path)  # over the page of the earlier one
     assert "--seed 0`" in (tmp_path / "simulation.md").read_text()
+    assert all(settings.playbacks for settings, *_ in made_up)
+
+
+def test_the_record_names_the_folder_of_meshes_and_not_the_path_to_it(made_up, monkeypatch, tmp_path):
+    monkeypatch.setattr("tdf_jax.sim.imitator.load_objects", lambda settings: [None] * 2)
+    folder = tmp_path / "home" / "mine"
+    folder.mkdir(parents=True)
+    words = ("--tasks", "mug_on_rack", "--episodes", 0, "--num-poses", 1, "--no-playbacks", "--out", tmp_path / "out")
+    run("--simulation", "--meshes", folder, *words)
+    assert {(one.meshes, episodes, one.playbacks) for one, episodes, _ in made_up} == {(folder.resolve(), 2, False)}
+    record, page = (tmp_path / "out" / name for name in ("simulation/simulation.json", "simulation.md"))
+    assert json.loads(record.read_text())["settings"]["meshes"] == "mine"
+    assert "--meshes mine --num-poses 1" in page.read_text() and str(tmp_path) not in page.read_text()
 
 
 @pytest.mark.parametrize(
@@ -653,6 +666,7 @@ def test_rows_of_a_simulation_become_a_page_and_a_record(made_up, tmp_path, caps
         (("--pairs", "3"), "--pairs is not for --simulation; expected one without the other"),
         (("--weights", "bowl"), "--weights is not for --simulation"),
         (("--relations",), "--relations and --simulation are given"),
+        (("--page", "--no-playbacks"), "--page plays what --no-playbacks leaves out"),
     ],
 )
 def test_bad_simulations_are_refused(made_up, words, message, tmp_path, capsys):
@@ -670,7 +684,9 @@ def test_a_page_of_a_simulation_that_is_the_users_is_not_overwritten(made_up, tm
     assert tree(tmp_path) == {"simulation.md": b"mine"} and not made_up
 
 
-@pytest.mark.parametrize("flag", [("--episodes", 3), ("--modes", "execute"), ("--light",), ("--processes", 2)])
+@pytest.mark.parametrize(
+    "flag", [("--episodes", 3), ("--modes", "execute"), ("--light",), ("--processes", 2), ("--no-playbacks",)]
+)
 def test_options_of_simulations_need_the_word(flag, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         run(*flag, "--out", tmp_path / "out")

@@ -618,7 +618,7 @@ def test_an_evaluation_has_a_row_for_every_method_condition_and_set(evaluation, 
         assert (row["iou"] is None) == (row["iou_refined"] is None) == (row["method"] != "small")
         assert row["position_median_cm"] == pytest.approx(np.median([error["position_cm"] for error in row["errors"]]))
         assert (row["interval_1cm_10deg"] is None) != generated
-    assert evaluation["settings"]["meshes"] == str(real) and evaluation["settings"]["seed"] == 3
+    assert evaluation["settings"]["meshes"] == real.name and evaluation["settings"]["seed"] == 3
     assert evaluation["weights"] == {"name": "small", "source": "a test"}
 
 

@@ -64,6 +64,7 @@ def refusal(tmp_path, capsys, monkeypatch):
         (["--pose", "sideways"], "sideways"),
         (["--recursive"], "--recursive is of --meshes; expected both, or neither"),
         (["--meshes", "nowhere"], "there is no folder nowhere"),
+        (["--page", "--no-playbacks"], "--page plays what --no-playbacks leaves out"),
     ],
     ids=lambda value: "" if isinstance(value, str) else " ".join(map(str, value))[:40],
 )

@@ -164,6 +164,15 @@ def test_an_episode_in_which_nothing_is_found_fails(imitator, monkeypatch, mode,
     assert not (kept["grasp"] or kept["place"] or kept["overall"] or kept["strict"]) and np.isnan(kept["slip"])
 
 
+@pytest.mark.parametrize("playbacks", [True, False])
+def test_motions_are_kept_unless_they_are_not_asked_for(imitator, monkeypatch, playbacks):
+    monkeypatch.setattr("tdf_jax.imitation.imitate", refuse)
+    made = imitator(method=LIBRARY)
+    made.settings = dataclasses.replace(made.settings, playbacks=playbacks)
+    campaign._run(made, 0)
+    assert (made.settings.folder / "episodes").is_dir() == playbacks
+
+
 def test_an_episode_whose_target_no_camera_sees_fails(imitator, monkeypatch):
     """One camera sees the object; the target is hidden from it, as by a wall."""
     from tdf_jax.sim import cameras

@@ -131,7 +131,7 @@ def test_a_page_of_each_failure_stands_beside_its_picture(monkeypatch, tmp_path,
     settings = named(folder=tmp_path)
     rows = [(settings, [run(3, "fell"), run(5, "not settled")])]
     save_playback("test", tmp_path / FOLDER, "it", short_playback(about_episode(settings, 3)))
-    with pytest.raises(PictureError, match=r"5-not_settled.html is missing .*episode 5 was run before episodes were"):
+    with pytest.raises(PictureError, match=r"5-not_settled.html is missing .*episode 5 is not kept to look at"):
         draw_failures("tdf simulate", rows, tmp_path / "failures", page=True)
     assert [one.name for one in (tmp_path / "failures").iterdir()] == [
         "bowl_on_shelf-execute-known-upright-3-fell.html"

@@ -1,7 +1,6 @@
 """The study of the planner: its search for postures against the draws' own, its table, and one task end to end."""
 
 import dataclasses
-import json
 
 import pytest
 
@@ -41,31 +40,45 @@ def test_the_table_has_shares_and_times_of_each_task_and_of_all():
     )
 
 
-def test_the_command_says_reasons_and_refuses_nothing_to_do(monkeypatch, capsys, tmp_path):
-    def planned(robot, task, poses, seed, number):
+def test_the_command_says_reasons_and_continues_where_it_stopped(monkeypatch, capsys, tmp_path):
+    planned = []
+
+    def plan(robot, task, poses, seed, number):
+        if len(planned) == 1:
+            planned.append("stop")
+            raise KeyboardInterrupt
+        planned.append(number)
         return Row(task, poses, number, 0, number > 0, "" if number else "the reason", 0.5)
 
-    monkeypatch.setattr(motion_study, "plan_task", planned)
+    monkeypatch.setattr(motion_study, "plan_task", plan)
     monkeypatch.setattr(motion_study, "load_robot", lambda file, site: None)
-    main(["--episodes", "2", "--tasks", "bowl_on_mug", "--poses", "tilt60", "--out", str(tmp_path / "rows.json")])
-    printed = capsys.readouterr().out
-    assert "bowl_on_mug tilt60 0: the reason" in printed and "| all | 2 | 50 % (0 to 100) | 0.50 s |" in printed
-    rows = json.loads((tmp_path / "rows.json").read_text())
-    assert [row["solved"] for row in rows] == [False, True] and set(rows[0]) == set(Row.__annotations__)
-    for words in (["--episodes", "0"], ["--seed", "-1"], ["--tasks", "nothing"]):
-        with pytest.raises(SystemExit):
-            main(words)
+    words = ["--episodes", "2", "--tasks", "bowl_on_mug", "--poses", "tilt60", "--out", str(tmp_path / "kept")]
+    with pytest.raises(KeyboardInterrupt):
+        main(words)
+    for _ in range(2):
+        capsys.readouterr()
+        main(words)
+        printed = capsys.readouterr().out
+        assert "bowl_on_mug tilt60 0: the reason" in printed and "| all | 2 | 50 % (0 to 100) | 0.50 s |" in printed
+    assert planned == [0, "stop", 1] and len(list((tmp_path / "kept").iterdir())) == 2
+    main([*words, "--seed", "1"])
+    assert planned == [0, "stop", 1, 0, 1]
 
 
 @pytest.mark.parametrize(
     "words, message",
     [
-        (["--out", "missing/rows.json"], "existing folder"),
-        (["--robot", "missing.xml", "--site", "grip"], "missing.xml"),
+        (["--out", "file"], "file"),
+        (["--out", "kept", "--robot", "missing.xml", "--site", "grip"], "missing.xml"),
+        (["--out", "kept", "--episodes", "0"], "--episodes: 0 is given; expected at least 1"),
+        (["--out", "kept", "--seed", "-1"], "--seed: -1 is given"),
+        (["--out", "kept", "--tasks", "nothing"], "nothing"),
+        ([], "--out"),
     ],
 )
 def test_mistakes_are_refused_before_the_work(words, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("mine")
     monkeypatch.setattr(motion_study, "plan_task", lambda *about: pytest.fail("it plans"))
     with pytest.raises(SystemExit) as stop:
         main(words)
