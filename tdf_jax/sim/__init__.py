@@ -14,9 +14,10 @@ Modules:
     segmentation: the cloud of one body from images of the whole scene
     removal_study: what the removal of a table and of flying pixels costs
     kinematics: inverse kinematics of an arm, at a pose and along a path
-    posture: the distinct positions of the joints with which the gripper is at a pose
-    collision: what touches what at planned positions
-    transit: free motions from one posture to another
+    configurations: the distinct positions of the joints with which the gripper is at a pose
+    gripper_path: dense poses along a trajectory, and the joints with which the arm follows them
+    collision: what touches what at planned positions, and what a plan may touch
+    rrt: free motions from one configuration to another
     joint_trajectory: a timed motion of the joints, and its files
     retiming: times of a path of the joints within limits of velocity and acceleration
     motion: motions of a robot along a trajectory, from home to home
@@ -36,7 +37,7 @@ Modules:
     campaign: many episodes in several processes
     report: success, causes of failure, and the record of a run
     published: published success rates, and which rows stand beside them
-    rows: campaigns that are planned together, and what each has shown
+    rows: campaigns that are planned together, and what became of the episodes of each
     sentences: what they show together, computed from their outcomes
     comparison: the page of many campaigns beside published rates, and their record
     recording: pictures and films of a cell

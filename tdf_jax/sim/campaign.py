@@ -1,4 +1,4 @@
-"""Many episodes: imitations of one demonstration in physics, in several processes, kept between runs."""
+"""Many episodes in physics under one condition, in several processes, kept between runs."""
 
 import concurrent.futures
 import contextlib
@@ -39,9 +39,7 @@ class Run:
         number: number of the episode.
         outcome: what became of it; that it was not drawn, if no start is within reach.
         rejected, redrawn: starts and pairs drawn before it; see `tdf_jax.sim.tasks.Episode`.
-        seconds: times of the imitation, and of planning and physics together, with what each compiled; they differ
-            from run to run.
-        planning: time of the planning alone; NaN if it is not known.
+        seconds: wall times of imitation, planning and physics, with what each compiled; they differ from run to run.
         instance: name of the user's mesh; empty for a generated object, of which every episode has its own.
     """
 
@@ -50,8 +48,7 @@ class Run:
     outcome: Outcome
     rejected: int
     redrawn: int
-    seconds: tuple[float, float]
-    planning: float = math.nan
+    seconds: tuple[float, float, float]
     instance: str = ""
 
     @property
@@ -83,7 +80,7 @@ def run_campaign(
 
     Args:
         settings: what the episodes share.
-        episodes: number of episodes. One of which no start is within reach is said to be not drawn.
+        episodes: number of episodes. The outcome of one of which no start is within reach says that it is not drawn.
         processes: number of processes; by default one for every core.
         progress: show a progress bar.
         view: show the first episode in MuJoCo's viewer while it runs, also if its outcome is kept; see `Viewer`.
@@ -159,8 +156,15 @@ def run_one(settings: Settings, number: int, view: bool = False) -> Run:
     result = _kept(settings, number, view)
     fields = {field.name: result[field.name].item() for field in dataclasses.fields(Outcome)}
     imitation, executed, planning = map(float, result["seconds"])
-    drawn, instance = (int(result["rejected"]), int(result["redrawn"])), result["instance"].item()
-    return Run(settings.condition, number, Outcome(**fields), *drawn, (imitation, executed), planning, instance)
+    return Run(
+        settings.condition,
+        number,
+        Outcome(**fields),
+        rejected=int(result["rejected"]),
+        redrawn=int(result["redrawn"]),
+        seconds=(imitation, planning, executed - planning),
+        instance=result["instance"].item(),
+    )
 
 
 def _kept(settings: Settings, number: int, view: bool = False) -> dict[str, np.ndarray]:
@@ -172,7 +176,7 @@ def _kept(settings: Settings, number: int, view: bool = False) -> dict[str, np.n
     return kept("tdf simulate", settings.folder, about, lambda: viewed or _run(imitator, number))
 
 
-def _run(imitator: Imitator, number: int, view: bool = False) -> dict:
+def _run(imitator: Imitator, number: int, view: bool = False) -> dict[str, Any]:
     """Imitate and run one episode: arrays to keep."""
     from tdf_jax.sim.episode import run_episode, teleport
     from tdf_jax.sim.playback import FOLDER, Sampler, save_playback
@@ -181,13 +185,10 @@ def _run(imitator: Imitator, number: int, view: bool = False) -> dict:
     condition, scan = imitator.condition, imitator.scan(number)
     instance = "" if scan is None else scan.name
     try:
-        episode, shown = imitator.episode(number)
-        found = imitator.found(episode, shown)
+        episode, demonstration = imitator.episode(number)
+        found = imitator.found(episode, demonstration)
     except NotDrawn as error:
-        return {
-            **dataclasses.asdict(Outcome.failure(NOT_DRAWN, str(error))),
-            **{"rejected": error.rejected, "redrawn": error.redrawn, "seconds": (0.0, 0.0, 0.0), "instance": instance},
-        }
+        return _arrays(Outcome.failure(NOT_DRAWN, str(error)), error, (0.0, 0.0, 0.0), instance)
     sampler = Sampler(episode, imitator.robot)
     began = planned = time.perf_counter()
 
@@ -215,13 +216,15 @@ def _run(imitator: Imitator, number: int, view: bool = False) -> dict:
     if imitator.settings.playbacks:
         playback = sampler.playback(_described(imitator.settings, number, instance, outcome), found.points, path)
         save_playback("tdf simulate", imitator.settings.folder / FOLDER, _file_name(imitator, number), playback)
-    return {
-        **dataclasses.asdict(outcome),
-        "rejected": episode.rejected,
-        "redrawn": episode.redrawn,
-        "seconds": seconds,
-        "instance": instance,
-    }
+    return _arrays(outcome, episode, seconds, instance)
+
+
+def _arrays(
+    outcome: Outcome, drawn: Episode | NotDrawn, seconds: tuple[float, float, float], instance: str
+) -> dict[str, Any]:
+    """What is kept of an episode; its times are those of imitation, of planning and physics, and of planning alone."""
+    counts = {"rejected": drawn.rejected, "redrawn": drawn.redrawn}
+    return {**dataclasses.asdict(outcome), **counts, "seconds": seconds, "instance": instance}
 
 
 def _file_name(imitator: Imitator, number: int) -> str:
@@ -261,8 +264,8 @@ def found_in(settings: Settings, number: int) -> tuple[Episode, "Robot", Found]:
     """
     imitator = load_imitator(settings)
     try:
-        episode, shown = imitator.episode(number)
-        found = imitator.found(episode, shown)
+        episode, demonstration = imitator.episode(number)
+        found = imitator.found(episode, demonstration)
     except NotDrawn as error:
         raise InputError(f"tdf simulate: episode {number} has no motion: {error}") from None
     if not len(found.paths):

@@ -1,12 +1,15 @@
-"""What touches what in a cell at planned positions: the arm, the hand, the held object and the surroundings."""
+"""What touches what in a cell at planned positions: arm, hand, object, target, table; what a plan may touch."""
 
 import dataclasses
 import functools
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from tdf_jax.sim.gripper_path import GripperPath
+from tdf_jax.sim.kinematics import Kinematics
 from tdf_jax.sim.physics import extra
 from tdf_jax.sim.robot import PREFIX
 from tdf_jax.sim.workcell import OBJECT, TABLE_NAME, TARGET, Workcell
@@ -14,6 +17,11 @@ from tdf_jax.sim.workcell import OBJECT, TABLE_NAME, TARGET, Workcell
 ARM, HAND_KIND, OBJECT_KIND, TARGET_KIND, TABLE_KIND, OTHER = range(6)
 NAMES = ("arm", "hand", "object", "target", "table", "surroundings")
 DEPTH = 0.0005  # metres of penetration that count as contact
+# Penetrations that a plan may have, metres. Clouds and fields know surfaces to a millimetre or two.
+TOUCHING = 0.002
+ITSELF = 0.0  # of the robot with itself, whose shape is known: with an overlap of 1 mm the arm got stuck at its wrist
+RESTING = 0.006  # of the object and what it stands on or is placed on, near both ends
+ENDS = 0.08  # metres from an end in which the object may touch its support or the target
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -78,6 +86,77 @@ class Collisions:
                     key = NAMES[a], NAMES[b]
                     found[key] = max(found.get(key, 0.0), -float(distance))
         return found
+
+
+def first_collision(
+    collisions: Collisions | None,
+    path: GripperPath,
+    joints: Float[np.ndarray, "rows joints"],
+    rows: Iterable[int],
+    opening: float,
+) -> str | None:
+    """The first collision that a plan may not have at some rows of a path, in words; None if there is none.
+
+    Args:
+        collisions: of the cell; None if there is nothing to stay clear of. The object is where it starts up to the
+            pick, in the hand up to the release, and where it was released from then on.
+        path: the path.
+        joints: positions of the joints along it, (rows, joints), radians.
+        rows: rows that are looked at, in order.
+        opening: opening of the fingers, metres.
+    """
+    if collisions is None:
+        return None
+    T_object = collisions.T_world_object
+    T_grip_object = path.in_hand(T_object)
+    near = {*path.near_pick(ENDS), *path.near_release(ENDS)}
+    for row in rows:
+        held = path.pick < row <= path.release
+        T = T_object
+        if T_grip_object is not None and row > path.pick:
+            T = path.poses[min(row, path.release)] @ T_grip_object
+        where = "to the pick" if row <= path.pick else ("along the path" if held else "on the retreat")
+        for (a, b), depth in collisions.depths(joints[row], opening, T).items():
+            pair = {a, b}
+            if pair in ({"hand"}, {"target", "table"}):
+                continue
+            if "object" in pair and "hand" in pair and held:
+                continue
+            allowed = ITSELF if pair <= {"arm", "hand"} else TOUCHING
+            if pair in ({"object", "table"}, {"object", "target"}):
+                allowed = np.inf if not held else (RESTING if row in near else TOUCHING)
+            if depth > allowed:
+                return f"{a} and {b} collide {where} (by {1e3 * depth:.0f} mm)"
+    return None
+
+
+def free_positions(
+    collisions: Collisions,
+    opening: float,
+    kinematics: Kinematics | None = None,
+    T_object: Float[np.ndarray, "4 4"] | None = None,
+) -> Callable[[Float[np.ndarray, " joints"]], bool]:
+    """A function of positions of the joints, (joints,), radians: whether a free motion may pass there.
+
+    Args:
+        collisions: of the cell.
+        opening: opening of the fingers, metres.
+        kinematics: of the arm, if the object is in the hand.
+        T_object: pose of the object, 4x4: in the gripper's frame if it is in the hand, else in the world's; None if
+            there is none.
+    """
+    meets = (("object", "table"), ("object", "target")) if kinematics is None else (("hand", "object"),)
+    passed = (*meets, ("hand", "hand"), ("target", "table"))
+
+    def free(positions) -> bool:
+        T = T_object if kinematics is None or T_object is None else kinematics.pose(positions) @ T_object
+        depths = collisions.depths(positions, opening, T)
+        return all(
+            pair in passed or depth <= (ITSELF if set(pair) <= {"arm", "hand"} else TOUCHING)
+            for pair, depth in depths.items()
+        )
+
+    return free
 
 
 def geom_kinds(cell: Workcell) -> np.ndarray:

@@ -34,7 +34,7 @@ def record(rows: Sequence[Row], settings: Mapping[str, Any]) -> dict[str, Any]:
         seconds.append(one.pop("seconds"))
         for name in ("schema", "tdf_jax", "seed"):  # of the whole record
             one.pop(name)
-        moved, (rejected, redrawn) = row.moved(), row.drawn()
+        moved, (rejected, redrawn) = row.in_hand_motion(), row.rejections()
         one["number_of_episodes"] = len(row.runs)
         one["rejected"], one["redrawn"] = rejected, redrawn
         one["moved_in_hand_median"] = None if moved is None else {"metres": moved[0], "degrees": moved[1]}
@@ -186,7 +186,7 @@ def _criteria(rows: Sequence[Row]) -> str:
 def _failures(rows: Sequence[Row]) -> str:
     cells = []
     for row in rows:
-        moved, (rejected, redrawn) = row.moved(), row.drawn()
+        moved, (rejected, redrawn) = row.in_hand_motion(), row.rejections()
         causes = ", ".join(f"{cause} {count}" for cause, count in row.causes.items())
         cells.append(
             [
@@ -230,8 +230,8 @@ def _times(rows: Sequence[Row], settings: Mapping[str, Any]) -> str:
     shares = ""
     # Both modes share what is imitated.
     shared = {row.condition._replace(mode="", mass=0.0): row.seconds()[:, 0] for row in rows}
-    spent = np.nansum(np.concatenate([row.seconds() for row in rows]), axis=0)
-    spent[0] = np.nansum(np.concatenate([*shared.values()]))
+    spent = np.concatenate([row.seconds() for row in rows]).sum(axis=0)
+    spent[0] = np.concatenate([*shared.values()]).sum()
     if spent.sum() > 0:
         parts = ", ".join(f"{name} {percent(float(one / spent.sum()))}" for name, one in zip(report.PARTS, spent))
         shares = f" Of all the time known here, with each imitation counted once: {parts}."

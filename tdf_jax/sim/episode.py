@@ -12,11 +12,11 @@ from tdf_jax.evaluation.relation_success import UPRIGHT, hole_is_crossed
 from tdf_jax.geometry.symmetry import ROUND
 from tdf_jax.shapes import Mug, Rack
 from tdf_jax.sim.collision import ARM, HAND_KIND, OBJECT_KIND, TABLE_KIND, TARGET_KIND, geom_kinds
+from tdf_jax.sim.configurations import HALF_TURN
 from tdf_jax.sim.execution import Payload, execute
-from tdf_jax.sim.grasping import MOST_SLIP, MOST_TURN, test_grasp
+from tdf_jax.sim.grasping import MOST_SLIP, MOST_TURN, evaluate_grasp
 from tdf_jax.sim.motion import Failure, plan_motion
 from tdf_jax.sim.physics import TIMESTEP, extra
-from tdf_jax.sim.posture import HALF_TURN
 from tdf_jax.sim.robot import Robot
 from tdf_jax.sim.tasks import TASKS, Episode
 from tdf_jax.sim.workcell import FIXTURE, OBJECT, TARGET, Workcell, build_workcell
@@ -147,7 +147,7 @@ def teleport(
             placement.
     """
     release = motion @ pick
-    grasp = test_grasp(
+    grasp = evaluate_grasp(
         robot,
         episode.object_body,
         episode.T_world_object,
@@ -162,11 +162,7 @@ def teleport(
         wrong = _pick_error(episode, pick)
         cause = "pick wrong" if wrong else "slipped"
         detail = wrong or f"{1e3 * grasp.slip:.0f} mm and {grasp.turn:.0f} degrees in the hand"
-    overall = grasp.held and placed
-    strict = overall and criteria["hung"]
-    return Outcome(
-        grasp.held, placed, overall, strict, "" if strict else cause, detail, grasp.slip, grasp.turn, **criteria
-    )
+    return _outcome(grasp.held, placed, criteria, cause, detail, grasp.slip, grasp.turn)
 
 
 def run_episode(
@@ -175,7 +171,7 @@ def run_episode(
     candidates: Sequence[Float[np.ndarray, "poses 4 4"]],
     openings: Sequence[float] | None = None,
     seed: int = 1,
-    watch=None,
+    watch: Callable[[Workcell, Any, str], None] | None = None,
     planned: Callable[[], None] | None = None,
     noted: Callable[[Workcell, Any, str], None] | None = None,
 ) -> Outcome:
@@ -210,21 +206,24 @@ def run_episode(
     observer.note(data, "end")
     placed, cause, detail, criteria = _judged(episode, cell, data, contacts)
     criteria["no_collision"] = not observer.collided
-    slip, turn = observer.moved_in_hand()
-    held = observer.held
+    slip, turn = observer.in_hand_motion()
     if observer.collided:
         placed, cause, detail = False, "collided", observer.collided
     elif cause or not observer.held:
         if not observer.held:
-            cause, detail = (
-                ("pick wrong", _pick_error(episode, plan.pick))
-                if _pick_error(episode, plan.pick)
-                else ("lost in transit", observer.lost)
-            )
+            wrong = _pick_error(episode, plan.pick)
+            cause, detail = ("pick wrong", wrong) if wrong else ("lost in transit", observer.lost)
         elif slip > MOST_SLIP or turn > MOST_TURN:
             cause, detail = "slipped", f"{1e3 * slip:.0f} mm and {turn:.0f} degrees in the hand; {detail}"
         elif observer.struck:
             cause, detail = "hit the target on approach", f"{observer.struck}; {detail}"
+    return _outcome(observer.held, placed, criteria, cause, detail, slip, turn)
+
+
+def _outcome(
+    held: bool, placed: bool, criteria: dict[str, bool], cause: str, detail: str, slip: float, turn: float
+) -> Outcome:
+    """The outcome of both protocols; a strict success has no cause of failure."""
     overall = held and placed
     strict = overall and criteria["hung"]
     return Outcome(held, placed, overall, strict, "" if strict else cause, detail, slip, turn, **criteria)
@@ -278,8 +277,8 @@ class _Observer:
         if self.noted is not None:
             self.noted(self.cell, data, word)
 
-    def moved_in_hand(self) -> tuple[float, float]:
-        """Movement of the object in the hand from closing to the release, metres and degrees."""
+    def in_hand_motion(self) -> tuple[float, float]:
+        """Slip and turn of the object in the hand, closing to release, metres and degrees; NaN if it was not closed."""
         if self.closed is None or self.last is None:
             return np.nan, np.nan
         moved = np.linalg.inv(self.closed) @ self.last

@@ -42,7 +42,7 @@ class Grasp:
     T_grip_object: Float[np.ndarray, "4 4"]
 
 
-def test_grasp(
+def evaluate_grasp(
     robot: Robot,
     one: Body,
     T_world_object: Float[np.ndarray, "4 4"],
@@ -92,10 +92,6 @@ def test_grasp(
     return Grasp(held, slip, turn, pulled, struck, closed)
 
 
-# pytest would collect it by its name; a function's type has no such attribute.
-test_grasp.__test__ = False  # type: ignore[attr-defined]
-
-
 class FloatingHand:
     """A gripper that floats, driven by a frame: it is moved as an ideal arm would.
 
@@ -111,7 +107,7 @@ class FloatingHand:
         opening: float,
         watch: Callable[[Workcell, Any, str], None] | None = None,
     ):
-        """Place the gripper, its fingers open; `watch` is called as by `test_grasp`."""
+        """Place the gripper, its fingers open; `watch` is called as by `evaluate_grasp`."""
         mujoco = extra("FloatingHand", "mujoco")
         self.cell, self.data, self._mujoco, self._watch = cell, cell.data(), mujoco, watch
         model = cell.model

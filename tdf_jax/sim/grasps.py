@@ -1,4 +1,4 @@
-"""Grasps that a demonstration shows: poses of a parallel gripper on generated objects that hold in physics."""
+"""Grasps of demonstrations: poses of a parallel gripper on generated objects that hold in physics."""
 
 from typing import NamedTuple
 
@@ -17,10 +17,7 @@ CLEARANCE = 0.018  # metres between each finger and the wall before closing
 LEAST_CLEARANCE = 0.002  # metres, where the fingers do not open so far
 RIM_DEPTH = 0.030  # metres from the rim down the wall to the tips of the fingers
 MOST_DEPTH = 0.6  # of the height of a low bowl
-DIRECTIONS, ROUND_TOLERANCE = (
-    24,
-    0.0015,
-)  # directions of widths about the axis, and their difference, metres, when round
+DIRECTIONS, ROUND_TOLERANCE = 24, 0.0015  # about the axis, and difference of the widths along them, metres, when round
 # Where a wall's middle is measured below the rim, metres: the gripper lies along the line through both.
 WALL_LEVELS = (0.004, 0.025)
 WALL_SEARCH = np.linspace(-0.07, 0.025, 951)  # metres along the outward direction

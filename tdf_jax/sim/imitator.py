@@ -146,7 +146,7 @@ class Imitator:
         # Of the package's robot nothing: its version is pinned.
         self.robot_content = [] if settings.robot is None else [digest(settings.robot.read_bytes()), settings.site]
         self.scans = load_objects(settings)
-        self._shown: dict[int, tuple[Episode, Demonstration] | NotDrawn] = {}
+        self._demonstrated: dict[int, tuple[Episode, Demonstration] | NotDrawn] = {}
         self._described: dict[int, Reference] = {}
         self._paper: dict[int, Reference] = {}
 
@@ -154,7 +154,7 @@ class Imitator:
         """The user's mesh that an episode has; None if its object is generated."""
         return self.scans[number % len(self.scans)] if self.scans else None
 
-    def shown(self, number: int) -> "tuple[Episode, Demonstration]":
+    def demonstrated(self, number: int) -> "tuple[Episode, Demonstration]":
         """The demonstrated episode and the demonstration.
 
         Raises:
@@ -162,15 +162,15 @@ class Imitator:
         """
         from tdf_jax.sim.tasks import demonstrate_episode, draw_episode
 
-        if number not in self._shown:
+        if number not in self._demonstrated:
             try:
                 episode = draw_episode(
                     self.condition.task, self.robot, self.settings.seed, FIRST_DEMONSTRATION + number, "upright"
                 )
-                self._shown[number] = episode, demonstrate_episode(episode, self.settings.seed)
+                self._demonstrated[number] = episode, demonstrate_episode(episode, self.settings.seed)
             except NotDrawn as error:  # so that it is not tried again for every episode
-                self._shown[number] = error
-        found = self._shown[number]
+                self._demonstrated[number] = error
+        found = self._demonstrated[number]
         if isinstance(found, NotDrawn):
             raise NotDrawn(f"{found} (of the demonstrations)")
         return found
@@ -181,7 +181,7 @@ class Imitator:
 
         if number not in self._described:
             several = range(DEMONSTRATIONS) if number < 0 else (number,)
-            demonstrations = [self.shown(one)[1] for one in several]
+            demonstrations = [self.demonstrated(one)[1] for one in several]
             self._described[number] = describe(self.model, demonstrations, target_model=self.target_model)
         return self._described[number]
 
@@ -190,7 +190,7 @@ class Imitator:
         from tdf_jax.sim.replay import describe_without_target
 
         if number not in self._paper:
-            self._paper[number] = describe_without_target(self.model, self.shown(number)[1])
+            self._paper[number] = describe_without_target(self.model, self.demonstrated(number)[1])
         return self._paper[number]
 
     def episode(self, number: int):
@@ -198,8 +198,8 @@ class Imitator:
         from tdf_jax.sim.tasks import draw_episode
 
         condition, seed = self.condition, self.settings.seed
-        shown = -1 if condition.demonstrations > 1 else number % DEMONSTRATIONS
-        known = self.shown(shown)[0] if condition.target == "known" else None
+        demonstration = -1 if condition.demonstrations > 1 else number % DEMONSTRATIONS
+        known = self.demonstrated(demonstration)[0] if condition.target == "known" else None
         episode = draw_episode(condition.task, self.robot, seed, number, condition.poses, known, self.scan(number))
         if condition.mass:
             body = dataclasses.replace(
@@ -208,7 +208,7 @@ class Imitator:
                 inertia=episode.object_body.inertia * (condition.mass / episode.object_body.mass),
             )
             episode.__dict__["object_body"] = body
-        return episode, shown
+        return episode, demonstration
 
     def depends_on(self, number: int) -> list:
         """All that an episode depends on besides its condition, as JSON values.
@@ -222,14 +222,14 @@ class Imitator:
             *(self.settings.seed, number, None if scan is None else [scan.name, scan.digest]),
         ]
 
-    def found(self, episode: Episode, shown: int) -> Found:
+    def found(self, episode: Episode, demonstration: int) -> Found:
         """What is imitated in an episode: kept, or computed and kept.
 
         Teleported and executed episodes, of whatever mass, share what is imitated, centred or not.
 
         Args:
             episode: the episode.
-            shown: number of the demonstration; -1 for all of them.
+            demonstration: number of the demonstration; -1 for all of them.
 
         Raises:
             NotDrawn: there is no demonstration.
@@ -239,17 +239,17 @@ class Imitator:
         method = LIBRARY if condition.method == UNCENTRED else condition.method
         shared = condition._replace(mode="", mass=0.0, method=method)
         about = ["imitation", *self.depends_on(episode.number), *shared]
-        result = kept("tdf simulate", self.settings.folder, about, lambda: self._found(episode, shown))
-        return self._opened(episode, shown, result)
+        result = kept("tdf simulate", self.settings.folder, about, lambda: self._found(episode, demonstration))
+        return self._opened(episode, demonstration, result)
 
-    def _opened(self, episode: Episode, shown: int, result: dict[str, np.ndarray]) -> Found:
+    def _opened(self, episode: Episode, demonstration: int, result: dict[str, np.ndarray]) -> Found:
         """What is imitated, with the fingers opened by the cloud, and centred by the condition's method."""
         paths, method = result["paths"], self.condition.method
         if method == TRUTH or not len(paths):
             openings = np.full(len(paths), episode.grip.opening)
         else:
-            demonstrated = self.shown(max(shown, 0))[0].grip.opening
-            centred = [centred_paths(path, result["points"], demonstrated, self.robot) for path in paths]
+            opening = self.demonstrated(max(demonstration, 0))[0].grip.opening
+            centred = [centred_paths(path, result["points"], opening, self.robot) for path in paths]
             if method == UNCENTRED:
                 openings = np.array([several[0][1] for several in centred])
             else:
@@ -259,14 +259,16 @@ class Imitator:
             paths, openings, result["motion"], result["reason"].item(), float(result["seconds"]), result["points"]
         )
 
-    def _found(self, episode: Episode, shown: int) -> dict[str, Any]:
+    def _found(self, episode: Episode, demonstration: int) -> dict[str, Any]:
         """Arrays to keep: those of `Found`, not centred, and the object's cloud."""
         if self.condition.method in NETWORKS:
-            self.reference(shown)  # what is wrong with the weights is no failure of an episode, and ends the campaign
+            self.reference(
+                demonstration
+            )  # what is wrong with the weights is no failure of an episode, and ends the campaign
         paths, points, motion, reason = np.zeros((0, 0, 4, 4)), np.zeros((0, 3)), np.eye(4), ""
         began = time.perf_counter()
         try:
-            paths, points, motion = self.imitated(episode, shown)
+            paths, points, motion = self.imitated(episode, demonstration)
         except NotDrawn:  # of the demonstrations
             raise
         except InputError as error:
@@ -274,7 +276,7 @@ class Imitator:
         seconds = time.perf_counter() - began
         return {"paths": np.array(paths), "points": points, "motion": motion, "reason": reason, "seconds": seconds}
 
-    def imitated(self, episode: Episode, shown: int) -> tuple[Sequence[np.ndarray], np.ndarray, np.ndarray]:
+    def imitated(self, episode: Episode, demonstration: int) -> tuple[Sequence[np.ndarray], np.ndarray, np.ndarray]:
         """Trajectories of the gripper, the best first, the object's cloud, and the motion of the object.
 
         Of the true ones no cloud is needed, and it is empty.
@@ -289,7 +291,7 @@ class Imitator:
             motion = episode.T_world_target @ episode.T_target_object @ np.linalg.inv(episode.T_world_object)
             return [np.asarray(path.matrices, float)], np.zeros((0, 3)), motion
         points, target_points = self.clouds(episode)
-        paths, motion = self.replay(episode.number, points, target_points, shown)
+        paths, motion = self.replay(episode.number, points, target_points, demonstration)
         return paths, points, motion
 
     def clouds(self, episode) -> tuple[np.ndarray, np.ndarray | None]:
@@ -347,7 +349,7 @@ class Imitator:
         cell = build_workcell(self.robot)
         return cell, cell.data()
 
-    def replay(self, number: int, points, target_points, shown: int) -> "Replay":
+    def replay(self, number: int, points, target_points, demonstration: int) -> "Replay":
         """What a method finds by the clouds."""
         import jax
 
@@ -357,20 +359,22 @@ class Imitator:
         method = self.condition.method
         key = jax.random.fold_in(jax.random.key(self.settings.seed), number)
         if method == REPLAY:
-            return replay.replay_by_centroids(self.shown(shown)[1], points, target_points)
+            return replay.replay_by_centroids(self.demonstrated(demonstration)[1], points, target_points)
         if method == ICP:
-            return replay.replay_by_registration(self.shown(shown)[1], points, target_points, key=key)
+            return replay.replay_by_registration(self.demonstrated(demonstration)[1], points, target_points, key=key)
         result = imitate(
             self.model,
-            self.reference(shown),
+            self.reference(demonstration),
             points,
             target_points=target_points,
             target_model=self.target_model,
             key=key,
         )
         if method == EVEN:
-            return replay.blend_evenly(self.shown(shown)[1], result)
+            return replay.blend_evenly(self.demonstrated(demonstration)[1], result)
         found = replay.replay_candidates(result)
         if method == PAPER:
-            return replay.replay_by_energy(self.model, self.paper_reference(shown), points, result.goal, key=key)
+            return replay.replay_by_energy(
+                self.model, self.paper_reference(demonstration), points, result.goal, key=key
+            )
         return found

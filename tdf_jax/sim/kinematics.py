@@ -41,15 +41,10 @@ class Kinematics:
         mujoco = extra("Kinematics", "mujoco")
         spec = mujoco.MjSpec()
         set_options(spec)
-        yaw = self.robot.yaw
-        spec.attach(
-            self.robot.spec(),
-            prefix=PREFIX,
-            frame=spec.worldbody.add_frame(quat=(np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))),
-        )
+        self.robot.attach_to(spec)
         # The fingers' joints would only make every step slower.
         fixed = [one for one in spec.joints if one.name.removeprefix(PREFIX) not in self.robot.joints]
-        for one in [*spec.keys, *spec.equalities, *spec.tendons, *spec.actuators, *fixed]:
+        for one in [*spec.equalities, *spec.tendons, *spec.actuators, *fixed]:
             spec.delete(one)
         return compiled(spec)
 
@@ -60,14 +55,12 @@ class Kinematics:
         task = mink.FrameTask(
             PREFIX + self.robot.site, "site", position_cost=1.0, orientation_cost=1.0, lm_damping=1e-6
         )
-        limits = [mink.ConfigurationLimit(self._model)]
-        arm = [int(self._model.joint(PREFIX + name).qposadr[0]) for name in self.robot.joints]
-        return mink, configuration, task, limits, arm
+        return mink, configuration, task, [mink.ConfigurationLimit(self._model)]
 
     def pose(self, joints: Float[np.ndarray, " joints"]) -> Float[np.ndarray, "4 4"]:
         """Pose of the gripper's frame, 4x4, metres, world frame, at positions of the joints, radians."""
-        _, configuration, _, _, arm = self._tools
-        configuration.update(self._full(joints, arm))
+        configuration = self._tools[1]
+        configuration.update(self._full(joints))
         return np.asarray(configuration.get_transform_frame_to_world(PREFIX + self.robot.site, "site").as_matrix())
 
     def solve(
@@ -83,13 +76,13 @@ class Kinematics:
         Returns:
             The positions, (joints,), radians; None if the search did not reach the pose.
         """
-        mink, configuration, task, limits, arm = self._tools
-        configuration.update(self._full(start, arm))
+        mink, configuration, task, limits = self._tools
+        configuration.update(self._full(start))
         task.set_target(mink.SE3.from_matrix(np.asarray(T, float)))
         for _ in range(iterations):
             error = task.compute_error(configuration)
             if np.linalg.norm(error[:3]) < POSITION_TOLERANCE and np.linalg.norm(error[3:]) < ROTATION_TOLERANCE:
-                return configuration.q[arm].copy()
+                return configuration.q[self._arm].copy()
             velocity = mink.solve_ik(configuration, [task], 1.0, "daqp", damping=DAMPING, limits=limits)
             configuration.integrate_inplace(velocity, 1.0)
         return None
@@ -100,15 +93,12 @@ class Kinematics:
         """Positions of the joints as of `solve`, by damped least squares: from far away, sooner and more often.
 
         Args:
-            T: the pose, 4x4, metres, world frame.
-            start: positions to begin at, (joints,), radians.
+            T: the pose, as of `solve`.
+            start: positions to begin at, as of `solve`.
             iterations: largest number of iterations.
-
-        Returns:
-            The positions within the limits, (joints,), radians; None if the search did not reach the pose.
         """
         mujoco = extra("Kinematics", "mujoco")
-        model, data, arm, site = self._model, self._data, self._tools[-1], self._site
+        model, data, arm, site = self._model, self._data, self._arm, self._site
         robot, joints = self.robot, np.array(start, float)
         wanted, found, back, turn = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
         mujoco.mju_mat2Quat(wanted, np.ascontiguousarray(T[:3, :3], float).ravel())
@@ -141,10 +131,14 @@ class Kinematics:
         return self._model.site(PREFIX + self.robot.site).id
 
     @functools.cached_property
+    def _arm(self) -> list[int]:
+        return [int(self._model.joint(PREFIX + name).qposadr[0]) for name in self.robot.joints]
+
+    @functools.cached_property
     def _dofs(self) -> list[int]:
         return [int(self._model.joint(PREFIX + name).dofadr[0]) for name in self.robot.joints]
 
-    def _full(self, joints, arm) -> np.ndarray:
+    def _full(self, joints: np.ndarray) -> np.ndarray:
         q = np.zeros(self._model.nq)
-        q[arm] = joints
+        q[self._arm] = joints
         return q

@@ -11,18 +11,17 @@ from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import host
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.trajectory import Trajectory
-from tdf_jax.sim.collision import Collisions
+from tdf_jax.sim.collision import Collisions, first_collision, free_positions
+from tdf_jax.sim.configurations import HALF_TURN, Configurations
+from tdf_jax.sim.gripper_path import GripperPath, lifted
 from tdf_jax.sim.joint_trajectory import JointTrajectory
-from tdf_jax.sim.kinematics import FOLLOWING, Kinematics, kinematics_of
-from tdf_jax.sim.posture import HALF_TURN, Postures
+from tdf_jax.sim.kinematics import kinematics_of
 from tdf_jax.sim.retiming import retime
 from tdf_jax.sim.robot import Robot
-from tdf_jax.sim.transit import RESOLUTION, connect
+from tdf_jax.sim.rrt import RESOLUTION, connect
 from tdf_jax.sim.workcell import Workcell
 
 APPROACH = 0.10  # metres along the approach before the pick, and back after the release
-SPACING, TURN = 0.005, 0.05  # metres and radians between poses for which the joints are computed
-MAX_STEP = 0.35  # radians, largest step of a joint between them; a larger one is another posture of the arm
 CLOSE_SECONDS, OPEN_SECONDS = 1.0, 0.6  # to close the fingers and to open them
 CARRYING = 0.4  # factor on the limits of velocity and acceleration with an object in the hand, which swings and slips
 RATE = 125.0  # samples per second
@@ -32,12 +31,7 @@ DEPARTURE, ARRIVAL = 0.08, 0.12  # metres of the path that are followed even whe
 SHORTER, SHORTEST = (1.0, 0.5), 0.25
 NARROW = 0.008  # radians between tested positions of free motions from ends that are so near
 LIFT = 0.04  # metres straight up from the pick, where neither the whole path nor its ends can be followed without
-MOST_POSTURES = 4  # postures tried at either end then
-# Penetrations that a plan may have, metres. Clouds and fields know surfaces to a millimetre or two.
-TOUCHING = 0.002
-ITSELF = 0.0  # of the robot with itself, whose shape is known: with an overlap of 1 mm the arm got stuck at its wrist
-RESTING = 0.006  # of the object and what it stands on or is placed on, near both ends
-ENDS = 0.08  # metres from an end in which the object may touch its support or the target
+MOST_CONFIGURATIONS = 4  # configurations tried at either end then
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -83,10 +77,10 @@ def plan_joints(
     """Plan the joints of a robot along a trajectory of its gripper: to the pick, along the path, and back home.
 
     The robot goes from home to a pose behind the pick, straight to the pick, closes, follows the trajectory (straight
-    lines and geodesics between its poses), opens, retreats along the approach and goes home. The first posture of the
-    arm for which everything is within the limits and free of collisions is taken. In a cell, where the arm cannot
-    follow the whole trajectory, it follows both ends, joined by a free motion with the object in the hand; where that
-    fails too, the trajectory begins with a straight lift of `LIFT`.
+    lines and geodesics between its poses), opens, retreats along the approach and goes home. The first configuration
+    of the arm for which everything is within the limits and free of collisions is taken. In a cell, where the arm
+    cannot follow the whole trajectory, it follows both ends, joined by a free motion with the object in the hand; where
+    that fails too, the trajectory begins with a straight lift of `LIFT`.
 
     Args:
         trajectory: poses of the gripper's frame from the pick to the release: z along the approach, y along the closing
@@ -160,16 +154,16 @@ def plan_motion(
     """
     kinematics = kinematics_of(robot)
     collisions = None if cell is None else Collisions(cell)
-    postures = Postures(kinematics)
+    configurations = Configurations(kinematics)
     reasons: list[tuple[int, str]] = []
     for number, (poses, opening) in enumerate(zip(candidates, openings, strict=True)):
         halves = np.eye(4), HALF_TURN
         variants = *itertools.product([0.0], halves, SHORTER), *itertools.product([0.0, LIFT], halves, [SHORTEST])
         for lift, half, share in variants:
-            turned = _lifted(np.asarray(poses, float) @ half, lift)
-            path = _Path(turned, share * approach)
+            turned = lifted(np.asarray(poses, float) @ half, lift)
+            path = GripperPath(turned, share * approach)
             ends = min(1.0, 2 * share) * DEPARTURE, share * ARRIVAL
-            ways = _ways(postures, collisions, path, opening, ends, seed, reasons)
+            ways = _ways(configurations, collisions, path, opening, ends, seed, reasons)
             for there, carried, away in ways:
                 # The fingers may still be around the object.
                 step = RESOLUTION if share > SHORTEST else NARROW
@@ -184,82 +178,38 @@ def plan_motion(
     return Failure(max(reasons)[1])
 
 
-def _lifted(poses: np.ndarray, lift: float) -> np.ndarray:
-    """A path that begins with a straight lift, metres: one that tilts what it picks at once would hit the table."""
-    if not lift or len(poses) < 2:
-        return poses
-    above = poses[0].copy()
-    above[2, 3] += lift
-    return np.concatenate([poses[:1], above[None], poses[1:]])
-
-
-class _Path:
-    """Dense poses of the gripper's frame, from behind the pick to behind the release."""
-
-    def __init__(self, poses: np.ndarray, approach: float):
-        behind = np.eye(4)
-        behind[2, 3] = -approach
-        corners = np.concatenate([[poses[0] @ behind], poses, [poses[-1] @ behind]])
-        rows, at = [corners[:1]], [0]
-        for start, end in zip(corners[:-1], corners[1:]):
-            rows.append(_between(start, end))
-            at.append(at[-1] + len(rows[-1]))
-        self.poses = np.concatenate(rows)
-        self.pick, self.release = at[1], at[-2]
-        steps = np.linalg.norm(np.diff(self.poses[:, :3, 3], axis=0, prepend=self.poses[:1, :3, 3]), axis=1)
-        self.lengths = steps.cumsum()
-
-    def near_pick(self, distance: float) -> np.ndarray:
-        """Rows from the pick up to a distance along the path, metres."""
-        rows = np.arange(self.pick, self.release + 1)
-        return rows[self.lengths[rows] - self.lengths[self.pick] <= distance]
-
-    def near_release(self, distance: float) -> np.ndarray:
-        """Rows from a distance along the path, metres, up to the release."""
-        rows = np.arange(self.pick, self.release + 1)
-        return rows[self.lengths[self.release] - self.lengths[rows] <= distance]
-
-
-def _between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Poses on the straight line and geodesic after one pose up to the next."""
-    from scipy.spatial.transform import Rotation, Slerp
-
-    rotations = Rotation.from_matrix(np.stack([start[:3, :3], end[:3, :3]]))
-    angle = (rotations[0].inv() * rotations[1]).magnitude()
-    distance = np.linalg.norm(end[:3, 3] - start[:3, 3])
-    count = max(1, int(np.ceil(max(distance / SPACING, angle / TURN))))
-    shares = np.arange(1, count + 1) / count
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = Slerp([0.0, 1.0], rotations)(shares).as_matrix()
-    poses[:, :3, 3] = start[:3, 3] + shares[:, None] * (end[:3, 3] - start[:3, 3])
-    return poses
-
-
 def _ways(
-    postures: Postures, collisions, path: _Path, opening: float, ends: tuple[float, float], seed: int, reasons
-) -> Iterator[tuple]:
-    """Joints to the pick, from there to the release, and away, for one posture of the arm after the other.
+    configurations: Configurations,
+    collisions: Collisions | None,
+    path: GripperPath,
+    opening: float,
+    ends: tuple[float, float],
+    seed: int,
+    reasons: list[tuple[int, str]],
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Joints to the pick, from there to the release, and away, for one configuration of the arm after the other.
 
-    The arm follows the whole path, or else both ends of it, joined by a free motion with the object in the hand.
+    The arm follows the whole path, or else both ends of it, joined by a free motion with the object in the hand. What
+    it cannot follow is added to the reasons, the farther it came the higher its number.
     """
-    kinematics, last = postures.kinematics, len(path.poses) - 1
+    kinematics, last = configurations.kinematics, len(path.poses) - 1
     leave, arrive = path.near_pick(ends[0])[-1], path.near_release(ends[1])[0]
     picks, releases = [], []
-    for posture in postures.at(path.poses[path.pick]):
-        start = _followed(kinematics, path, posture, path.pick, 0, leave)
+    for configuration in configurations.at(path.poses[path.pick]):
+        start = path.followed(kinematics, configuration, path.pick, 0, leave)
         if start is None:
             reasons.append((1, "the arm cannot follow the path within its limits"))
             continue
-        blocked = _blocked(collisions, path, start, range(leave + 1), opening)
+        blocked = first_collision(collisions, path, start, range(leave + 1), opening)
         if blocked is not None:
             reasons.append((2, blocked))
             continue
         picks.append(start)
-        whole = _followed(kinematics, path, start[leave], leave, leave, last)
+        whole = path.followed(kinematics, start[leave], leave, leave, last)
         if whole is None:
             reasons.append((1, "the arm cannot follow the path within its limits"))
             continue
-        blocked = _blocked(collisions, path, whole, range(leave + 1, last + 1), opening)
+        blocked = first_collision(collisions, path, whole, range(leave + 1, last + 1), opening)
         if blocked is None:
             yield (
                 start[: path.pick + 1],
@@ -270,17 +220,15 @@ def _ways(
             reasons.append((2, blocked))
     if not picks or collisions is None or arrive <= leave:
         return
-    for posture in postures.at(path.poses[path.release]):
-        end = _followed(kinematics, path, posture, path.release, arrive, last)
-        if end is not None and _blocked(collisions, path, end, range(arrive, last + 1), opening) is None:
+    for configuration in configurations.at(path.poses[path.release]):
+        end = path.followed(kinematics, configuration, path.release, arrive, last)
+        if end is not None and first_collision(collisions, path, end, range(arrive, last + 1), opening) is None:
             releases.append(end)
-            if len(releases) == MOST_POSTURES:
+            if len(releases) == MOST_CONFIGURATIONS:
                 break
     robot = kinematics.robot
-    T_object = collisions.T_world_object
-    T_grip_object = None if T_object is None else np.linalg.inv(path.poses[path.pick]) @ T_object
-    free = _free(collisions, opening, kinematics, T_grip_object)
-    for start in picks[:MOST_POSTURES]:
+    free = free_positions(collisions, opening, kinematics, path.in_hand(collisions.T_world_object))
+    for start in picks[:MOST_CONFIGURATIONS]:
         for end in releases:
             middle = connect(start[leave], end[arrive], robot.lower, robot.upper, free, seed)
             if middle is None:
@@ -294,81 +242,26 @@ def _joined(*parts: np.ndarray) -> np.ndarray:
     return np.concatenate([part for part in parts if len(part)])
 
 
-def _followed(
-    kinematics: Kinematics, path: _Path, posture: np.ndarray, at: int, first: int, last: int
-) -> np.ndarray | None:
-    """Joints along a path from `first` to `last`, from a posture at one of its poses; None if the arm cannot follow."""
-    joints = np.full((len(path.poses), len(posture)), np.nan)
-    joints[at] = posture
-    for way in (range(at - 1, first - 1, -1), range(at + 1, last + 1)):
-        before = posture
-        for row in way:
-            solution = kinematics.solve(path.poses[row], before, FOLLOWING)
-            if solution is None or np.abs(solution - before).max() > MAX_STEP:
-                return None
-            joints[row] = before = solution
-    return joints
-
-
-def _blocked(collisions: Collisions | None, path: _Path, joints, rows, opening: float) -> str | None:
-    """The first collision at some rows of a path, in words."""
-    if collisions is None:
-        return None
-    T_object = collisions.T_world_object
-    T_gripper_object = None if T_object is None else np.linalg.inv(path.poses[path.pick]) @ T_object
-    near = {*path.near_pick(ENDS), *path.near_release(ENDS)}
-    for row in rows:
-        held = path.pick < row <= path.release
-        T = T_object
-        if T_gripper_object is not None and row > path.pick:
-            T = path.poses[min(row, path.release)] @ T_gripper_object
-        where = "to the pick" if row <= path.pick else ("along the path" if held else "on the retreat")
-        for (a, b), depth in collisions.depths(joints[row], opening, T).items():
-            pair = {a, b}
-            if pair in ({"hand"}, {"target", "table"}):
-                continue
-            if "object" in pair and "hand" in pair and held:
-                continue
-            allowed = ITSELF if pair <= {"arm", "hand"} else TOUCHING
-            if pair in ({"object", "table"}, {"object", "target"}):
-                allowed = np.inf if not held else (RESTING if row in near else TOUCHING)
-            if depth > allowed:
-                return f"{a} and {b} collide {where} (by {1e3 * depth:.0f} mm)"
-    return None
-
-
-def _free(collisions: Collisions, opening: float, kinematics: Kinematics | None = None, T_object=None):
-    """Whether nothing collides at positions of the joints.
-
-    With kinematics the object is in the hand, at a pose in the gripper's frame; without at a pose in the world.
-    """
-    meets = (("object", "table"), ("object", "target")) if kinematics is None else (("hand", "object"),)
-    passed = (*meets, ("hand", "hand"), ("target", "table"))
-
-    def free(positions) -> bool:
-        T = T_object if kinematics is None or T_object is None else kinematics.pose(positions) @ T_object
-        depths = collisions.depths(positions, opening, T)
-        return all(
-            pair in passed or depth <= (ITSELF if set(pair) <= {"arm", "hand"} else TOUCHING)
-            for pair, depth in depths.items()
-        )
-
-    return free
-
-
 def _transits(
-    robot: Robot, collisions: Collisions | None, path: _Path, first, last, opening: float, seed: int, resolution: float
-):
+    robot: Robot,
+    collisions: Collisions | None,
+    path: GripperPath,
+    first: np.ndarray,
+    last: np.ndarray,
+    opening: float,
+    seed: int,
+    resolution: float,
+) -> tuple[np.ndarray, np.ndarray] | None:
     """Free paths from home to the first pose and from the last pose home."""
     if collisions is None:
         return np.stack([robot.home, first]), np.stack([last, robot.home])
     T_start = collisions.T_world_object
     T_end = None if T_start is None else path.poses[path.release] @ np.linalg.inv(path.poses[path.pick]) @ T_start
     limits = robot.lower, robot.upper
-    there = connect(robot.home, first, *limits, _free(collisions, opening, T_object=T_start), seed, resolution)
+    there = connect(robot.home, first, *limits, free_positions(collisions, opening, T_object=T_start), seed, resolution)
     if there is None:
         return None
-    back = connect(last, robot.home, *limits, _free(collisions, opening, T_object=T_end), seed, resolution)
+    back = connect(last, robot.home, *limits, free_positions(collisions, opening, T_object=T_end), seed, resolution)
     return None if back is None else (there, back)
 
 

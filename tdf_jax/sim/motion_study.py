@@ -1,7 +1,7 @@
 """How many reachable tasks the planner solves, and in what time, with the true pick and the true release.
 
-A task is reachable if the arm has postures without collision at the pick and at the release, by a search of its own:
-mink from random starts, where the planner has its own damped least squares. Starts that are not reachable are
+A task is reachable if the arm has configurations without collision at the pick and at the release, by a search of its
+own: mink from random starts, where the planner has its own damped least squares. Starts that are not reachable are
 drawn again, and every task that is drawn counts. A run that was interrupted computes what is missing.
 
 python -m tdf_jax.sim.motion_study --episodes 20 --out runs/motions
@@ -22,10 +22,10 @@ from tdf_jax.evaluation.statistics import bootstrap_interval
 from tdf_jax.evaluation.study_command import study_parser
 from tdf_jax.evaluation.tables import between, markdown, percent
 from tdf_jax.sim.collision import Collisions
+from tdf_jax.sim.configurations import HALF_TURN
 from tdf_jax.sim.episode import start_cell
 from tdf_jax.sim.kinematics import kinematics_of
 from tdf_jax.sim.motion import Failure, plan_motion
-from tdf_jax.sim.posture import HALF_TURN
 from tdf_jax.sim.robot import Robot, load_robot
 from tdf_jax.sim.tasks import POSES, TASKS, Episode, draw_episode, true_path
 
@@ -57,7 +57,7 @@ class Row:
 
 
 def reachable(episode: Episode, robot: Robot, collisions: Collisions) -> bool:
-    """Whether the arm has postures without collision at the true pick and the true release, by random restarts.
+    """Whether the arm has configurations without collision at the true pick and the true release, by random restarts.
 
     Args:
         episode: the episode.

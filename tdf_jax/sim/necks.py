@@ -173,11 +173,9 @@ def _profile(heights, radii, levels) -> np.ndarray:
     bend = SMOOTH * np.diff(np.eye(len(knots)), n=2, axis=0)
     weights, fit = np.ones(len(radii)), np.zeros(len(knots))
     for _ in range(10):
-        rows_of, values = (
-            np.concatenate([weights[:, None] * rows, bend]),
-            np.concatenate([weights * radii, np.zeros(len(bend))]),
-        )
-        fit = np.linalg.lstsq(rows_of, values, rcond=None)[0]
+        weighted = np.concatenate([weights[:, None] * rows, bend])
+        values = np.concatenate([weights * radii, np.zeros(len(bend))])
+        fit = np.linalg.lstsq(weighted, values, rcond=None)[0]
         weights = np.sqrt(1 / np.maximum(np.abs(radii - rows @ fit), NOISE / 4))
         weights /= weights.max()
     return np.interp(levels, knots, fit)

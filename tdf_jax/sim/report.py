@@ -134,21 +134,18 @@ def summary(runs: Sequence[Run]) -> str:
         f"  drawn before: {rejected} starts out of reach, {redrawn} pairs that do not fit or have no start within reach"
     )
     for words, values in (("median", np.median(parts, axis=0)), ("all episodes", parts.sum(axis=0))) if used else ():
-        named = (f"{name} {_seconds(value)}" for name, value in zip(PARTS, values))
+        named = (f"{name} {value:.1f}" for name, value in zip(PARTS, values))
         lines.append(f"  seconds, {words}: {', '.join(named)}")
     return "\n".join(lines)
 
 
 def seconds(runs: Sequence[Run]) -> Float[np.ndarray, "episodes 3"]:
-    """Wall times of imitation, planning and physics, (episodes, 3), seconds.
-
-    The last two are NaN where an earlier version kept only their sum; `teleport` plans nothing.
+    """Wall times of imitation, planning and physics, (episodes, 3), seconds; `teleport` plans nothing.
 
     Args:
         runs: the episodes.
     """
-    parts = [(one.seconds[0], one.planning, one.seconds[1] - one.planning) for one in runs]
-    return np.array(parts, float).reshape(-1, len(PARTS))
+    return np.array([one.seconds for one in runs], float).reshape(-1, len(PARTS))
 
 
 def _value(run: Run, name: str, value):
@@ -158,22 +155,16 @@ def _value(run: Run, name: str, value):
     return None if name in CRITERIA and not is_tested(name, run.condition) else value
 
 
-def _seconds(value: float) -> str:
-    return f"{value:.1f}" if np.isfinite(value) else "unknown"
-
-
 def record(settings: Settings, runs: Sequence[Run]) -> dict[str, Any]:
     """The JSON record of a run: what is the same on a rerun, and "seconds", which are not.
 
-    Under "seconds" are the sums of the wall times of imitation, planning and physics, and these of every episode; null
-    where they are not known.
+    Under "seconds" are the sums of the wall times of imitation, planning and physics, and these of every episode.
 
     Args:
         settings: what the episodes share.
         runs: the episodes.
     """
     parts = seconds(runs)
-    times = [[value if np.isfinite(value) else None for value in row] for row in (parts.sum(axis=0), *parts)]
     return {
         "schema": SCHEMA,
         "tdf_jax": version("tdf_jax"),
@@ -196,5 +187,5 @@ def record(settings: Settings, runs: Sequence[Run]) -> dict[str, Any]:
             }
             for one in runs
         ],
-        "seconds": {**dict(zip(PARTS, times[0])), "episodes": times[1:]},
+        "seconds": {**dict(zip(PARTS, parts.sum(axis=0).tolist())), "episodes": parts.tolist()},
     }

@@ -75,6 +75,13 @@ class Robot:
         """A new `mujoco.MjSpec` of the robot, to attach to a cell."""
         return _spec(self.files, self.mount)
 
+    def attach_to(self, spec: Any) -> None:
+        """Attach the robot to a `mujoco.MjSpec`, at the origin as it stands in a cell; its keyframes stay out."""
+        frame = spec.worldbody.add_frame(quat=(np.cos(self.yaw / 2), 0, 0, np.sin(self.yaw / 2)))
+        spec.attach(self.spec(), prefix=PREFIX, frame=frame)
+        for key in list(spec.keys):  # of the robot's joints alone
+            spec.delete(key)
+
     def hand_spec(self) -> Any:
         """A new `mujoco.MjSpec` of the gripper and the arm's last link, which is its first body, at the origin."""
         mujoco = extra("load_robot()", "mujoco")

@@ -1,4 +1,4 @@
-"""Rows of a comparison: campaigns that are planned together, and what each has shown."""
+"""Rows of a comparison: campaigns that are planned together, and what became of the episodes of each."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ from tdf_jax.sim.condition import DEMONSTRATIONS, GENERATED, LIBRARY, SEGMENTED,
 from tdf_jax.sim.physics import LIGHT_MASS
 from tdf_jax.sim.tasks import TASKS
 
-# Targets of each task as the published protocols have them: NDF's stay where they were shown, R-NDF's are found.
+# Targets of each task as the published protocols have them: NDF's stay where they were demonstrated, R-NDF's are found.
 TARGETS = {
     "mug_on_rack": ("known", "found"),
     "bowl_on_shelf": ("known",),
@@ -58,13 +58,12 @@ class Row:
             return 0.0, 1.0
         low, high = interval or (share, share)
         if low == high:
-            reach = 3 / len(
-                {one.object for one in self.runs}
-            )  # of n successes, a rate below 1 - 3 / n is unlikely (5 %)
+            # Of n successes, a rate below 1 - 3 / n is unlikely (5 %).
+            reach = 3 / len({one.object for one in self.runs})
             low, high = max(low - reach, 0.0), min(high + reach, 1.0)
         return low, high
 
-    def moved(self) -> tuple[float, float] | None:
+    def in_hand_motion(self) -> tuple[float, float] | None:
         """Median movement in the hand after closing, metres and degrees; None if nothing was held."""
         moved = np.array([(one.outcome.slip, one.outcome.turn) for one in self.runs], float).reshape(-1, 2)
         moved = moved[np.isfinite(moved).all(axis=1)]
@@ -73,12 +72,12 @@ class Row:
         slip, turn = np.median(moved, axis=0)
         return float(slip), float(turn)
 
-    def drawn(self) -> tuple[int, int]:
+    def rejections(self) -> tuple[int, int]:
         """Numbers of starts out of reach, and of pairs that do not fit or of which no start is within reach."""
         return sum(one.rejected for one in self.all), sum(one.redrawn for one in self.all)
 
     def seconds(self) -> Float[np.ndarray, "episodes 3"]:
-        """Wall times of `tdf_jax.sim.report.PARTS`, (episodes, 3), seconds; NaN where one is not known."""
+        """Wall times of `tdf_jax.sim.report.PARTS`, (episodes, 3), seconds."""
         return report.seconds(self.runs)
 
 

@@ -28,9 +28,9 @@ from tdf_jax.shapes import FAMILIES, Mug, Rack, Shape
 from tdf_jax.sim.board import Board
 from tdf_jax.sim.bodies import Body, body_of
 from tdf_jax.sim.collision import Collisions
+from tdf_jax.sim.configurations import HALF_TURN
 from tdf_jax.sim.grasps import Grip, grip_of
 from tdf_jax.sim.kinematics import kinematics_of
-from tdf_jax.sim.posture import HALF_TURN
 from tdf_jax.sim.robot import Robot
 from tdf_jax.sim.scans import Scan
 from tdf_jax.sim.swing import level_rotations
@@ -48,11 +48,11 @@ GRIPPER_POINTS = 256
 STARTS, MOST_PAIRS = 25, 20  # starts that are drawn of a pair, and pairs that are drawn of an episode
 OTHER_PAIRS = 10_000_000  # between the numbers of the pairs of an episode
 BEHIND = 0.10  # metres behind the pick and the release, along the approach, which must be within reach too
-SAME_POSTURE = 1.5  # radians, largest movement of a joint on the way there
+SAME_CONFIGURATION = 1.5  # radians, largest movement of a joint on the way there
 # Sine of the tilt from which a held object swings, and angles, radians, between the closing direction and the plane in
 # which it would not swing that are tried.
 UPRIGHT, OFF_PLANE = 0.02, tuple(np.radians([0.0, 5.0, -5.0]))
-SEARCHES = 12  # starts of the search for a posture of the arm at the true pick and at the true release
+SEARCHES = 12  # starts of the search for a configuration of the arm at the true pick and at the true release
 
 
 class Task(NamedTuple):
@@ -252,7 +252,7 @@ def _body(one: Shape | Scan) -> Body:
 
 
 def within_reach(episode: Episode, robot: Robot, collisions: Collisions) -> bool:
-    """Whether the arm has postures at the true pick and the true release, and behind them, in which nothing collides.
+    """Whether the arm has free configurations at the true pick and the true release, and behind them.
 
     Args:
         episode: the episode.
@@ -278,7 +278,7 @@ def within_reach(episode: Episode, robot: Robot, collisions: Collisions) -> bool
             if joints is None or not free(joints, T_object, meet):
                 continue
             away = kinematics.solve(pose @ behind, joints)
-            if away is not None and np.abs(away - joints).max() < SAME_POSTURE and free(away, T_object, meet):
+            if away is not None and np.abs(away - joints).max() < SAME_CONFIGURATION and free(away, T_object, meet):
                 break
         else:
             return False

@@ -160,10 +160,7 @@ def build_workcell(
     else:
         spec = mujoco.MjSpec()
         set_options(spec)
-        frame = spec.worldbody.add_frame(quat=(np.cos(robot.yaw / 2), 0, 0, np.sin(robot.yaw / 2)))
-        spec.attach(robot.spec(), prefix=PREFIX, frame=frame)
-        for key in list(spec.keys):  # of the robot's joints alone
-            spec.delete(key)
+        robot.attach_to(spec)
     if table:
         centre, half = TABLE
         box = mujoco.mjtGeom.mjGEOM_BOX

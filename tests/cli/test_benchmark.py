@@ -607,7 +607,7 @@ def made_up(monkeypatch):
     def campaign(settings, episodes, processes):
         asked.append((settings, episodes, processes))
         for number in range(episodes):
-            yield Run(settings.condition, number, fell if number % 2 else good, 0, 0, (1.0, 2.0))
+            yield Run(settings.condition, number, fell if number % 2 else good, 0, 0, (1.0, 2.0, 3.0))
 
     monkeypatch.setattr("tdf_jax.sim.campaign.run_campaign", campaign)
     return asked

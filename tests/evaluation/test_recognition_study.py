@@ -46,8 +46,8 @@ def test_a_fit_separates_what_it_was_fitted_to(evidence, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--count", "0"], "--count must be at least 1"),
-        (["--seed", "-1"], "--seed at least 0"),
+        (["--count", "0"], "--count: 0 is given; expected at least 1"),
+        (["--seed", "-1"], "--seed: -1 is given; expected at least 0"),
         (["--out", "nowhere/record.json"], "expected a file in an existing folder"),
         (["--task", "bowl_on_mug", "--weights", "mug"], "drop --weights and --category"),
     ],

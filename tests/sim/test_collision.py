@@ -31,7 +31,7 @@ def reached(robot):
 
     def at(x, y, z):
         joints = robot.home
-        for height in (*np.arange(0.4, z, -0.02), z):  # on the way down, without another posture
+        for height in (*np.arange(0.4, z, -0.02), z):  # on the way down, without another configuration
             joints = kinematics_of(robot).solve(downward(x, y, height), joints)
             assert joints is not None
         return joints

@@ -37,7 +37,7 @@ def row(tmp_path):
 
     def make(*outcomes, **changes):
         condition = RACK._replace(**changes)
-        runs = [Run(condition, n, one, n % 3, n % 2, (2.0 + n, 20.0 + n), 5.0) for n, one in enumerate(outcomes)]
+        runs = [Run(condition, n, one, n % 3, n % 2, (2.0 + n, 5.0, 15.0 + n)) for n, one in enumerate(outcomes)]
         return Row(Settings(condition, "mug", "rack", 3, tmp_path), runs)
 
     return make
@@ -196,15 +196,6 @@ def test_a_row_of_which_nothing_was_drawn_says_so(row):
     assert "![The first failed episode of each cause](a.png)" in page([row(GOOD)], SETTINGS, "a.png")
 
 
-def test_times_that_are_not_known_are_said_to_be_unknown(row):
-    one = row(GOOD, GOOD)
-    one.runs[:] = [dataclasses.replace(run, planning=np.nan) for run in one.runs]
-    text = page([one], SETTINGS)
-    (times,) = table(text, "## Times")
-    assert times["planning"] == times["physics"] == times["all episodes, minutes"] == "unknown"
-    assert json.dumps(record([one], SETTINGS), allow_nan=False)
-
-
 def test_nothing_held_is_no_movement(row):
     (failed,) = table(page([row(NEVER, NEVER)], SETTINGS), "## Failures and draws")
     assert failed["moved in the hand"] == ""
@@ -298,7 +289,7 @@ def test_a_record_is_the_same_on_a_rerun_but_for_times_and_the_machine(row):
     assert first["episodes"][1]["cause"] == "unreachable" and made["settings"]["seed"] == 3
     for one in rows:
         one.all[:] = [
-            Run(run.condition, run.number, run.outcome, run.rejected, run.redrawn, (9.0, 9.0)) for run in one.runs
+            Run(run.condition, run.number, run.outcome, run.rejected, run.redrawn, (9.0, 9.0, 9.0)) for run in one.runs
         ]
     again = json.loads(json.dumps(record(rows, SETTINGS)))
     assert {key for key in made if made[key] != again[key]} == {"seconds"}

@@ -22,7 +22,7 @@ GOOD = Outcome(True, True, True, True, "", "", 0.0, 0.0)
 
 def run(number, cause, condition=SHELF, grasp=True):
     outcome = Outcome(grasp, False, False, False, cause, "because", 0.0, 0.0) if cause else GOOD
-    return Run(condition, number, outcome, 0, 0, (0.0, 0.0))
+    return Run(condition, number, outcome, 0, 0, (0.0, 0.0, 0.0))
 
 
 def named(name="bowl", folder=Path()):

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 import tdf_jax as tdf
 from tdf_jax.sim import physics
 from tdf_jax.sim.bodies import body_of
-from tdf_jax.sim.grasping import FloatingHand, test_grasp
+from tdf_jax.sim.grasping import FloatingHand, evaluate_grasp
 from tdf_jax.sim.grasps import grip_of
 from tdf_jax.sim.workcell import OBJECT, build_workcell
 
@@ -23,7 +23,7 @@ def mug(robot):
 
 def test_a_mug_at_its_rim_is_held(robot, mug):
     body, T, grip = mug
-    upright = test_grasp(robot, body, T, T @ grip.T_object_grip, grip.opening)
+    upright = evaluate_grasp(robot, body, T, T @ grip.T_object_grip, grip.opening)
     assert upright.held and upright.slip < 0.005 and upright.turn < 5 and upright.pulled < 0.01
     assert upright.struck == 0
 
@@ -32,7 +32,7 @@ def test_a_hand_beside_the_mug_holds_nothing(robot, mug):
     body, T, grip = mug
     beside = T @ grip.T_object_grip
     beside[:3, 3] += (0, 0.15, 0.02)
-    empty = test_grasp(robot, body, T, beside, grip.opening)
+    empty = evaluate_grasp(robot, body, T, beside, grip.opening)
     assert not empty.held and empty.pulled < 1e-3 and empty.slip > 0.1  # the hand leaves, the mug stays
 
 
@@ -40,7 +40,7 @@ def test_a_hand_in_the_wall_is_struck(robot, mug):
     body, T, grip = mug
     inside = T @ grip.T_object_grip
     inside[:3, :3] = inside[:3, :3] @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    assert test_grasp(robot, body, T, inside, 0.0).struck > 0.002
+    assert evaluate_grasp(robot, body, T, inside, 0.0).struck > 0.002
 
 
 @pytest.mark.slow
@@ -48,10 +48,10 @@ def test_a_turned_and_a_fixed_mug_are_held(robot, mug):
     body, T, grip = mug
     pick = T @ grip.T_object_grip
     sideways = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]) @ pick[:3, :3]
-    assert test_grasp(robot, body, T, pick, grip.opening, rotation=sideways).held
+    assert evaluate_grasp(robot, body, T, pick, grip.opening, rotation=sideways).held
     above = np.eye(4)
     above[2, 3] = 0.2
-    fixed = test_grasp(robot, body, above @ T, above @ pick, grip.opening, fixture=True)
+    fixed = evaluate_grasp(robot, body, above @ T, above @ pick, grip.opening, fixture=True)
     assert fixed.held and fixed.pulled < 0.01
 
 
@@ -63,7 +63,7 @@ def test_without_friction_the_mug_falls(robot, mug, monkeypatch):
     cell.model.geom_friction[:] = 1e-5
     monkeypatch.setattr("tdf_jax.sim.grasping.build_workcell", lambda *arguments, **options: cell)
     assert physics.FRICTION[0] > 0.5
-    assert not test_grasp(robot, body, T, T @ grip.T_object_grip, grip.opening).held
+    assert not evaluate_grasp(robot, body, T, T @ grip.T_object_grip, grip.opening).held
 
 
 def test_a_floating_hand_is_where_it_is_driven_to(robot, mug):
@@ -91,7 +91,7 @@ def test_a_heavy_tilted_bottle_is_held_in_the_plane_of_its_tilt_and_swings_acros
     for turn in (0.0, 90.0):
         about = np.eye(4)
         about[:3, :3] = Rotation.from_euler("z", turn, degrees=True).as_matrix()
-        held.append(test_grasp(robot, body, T, T @ about @ grip.T_object_grip, grip.opening, fixture=True))
+        held.append(evaluate_grasp(robot, body, T, T @ about @ grip.T_object_grip, grip.opening, fixture=True))
     plane, across = held
     assert plane.held and plane.slip < 0.006 and plane.turn < 4 and plane.pulled < 0.002
     assert not across.held and across.slip > 0.03 and across.turn > 20

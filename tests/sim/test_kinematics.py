@@ -1,4 +1,4 @@
-"""Inverse kinematics: poses of postures are reached again, as the arm of a cell has them."""
+"""Inverse kinematics: poses of configurations are reached again, as the arm of a cell has them."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def test_pose_solve_pose(robot, kinematics):
         assert np.linalg.norm(reached[:3, :3] - T[:3, :3]) < 2 * ROTATION_TOLERANCE
 
 
-def test_a_search_from_anywhere_finds_all_eight_postures_of_an_arm_of_six_joints(robot, kinematics):
+def test_a_search_from_anywhere_finds_all_eight_configurations_of_an_arm_of_six_joints(robot, kinematics):
     T, rng, found = downward(0.45, 0.1, 0.2), np.random.default_rng(3), []
     for _ in range(80):
         joints = kinematics.search(T, rng.uniform(-np.pi, np.pi, 6))

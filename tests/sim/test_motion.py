@@ -8,8 +8,9 @@ import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.sim.board import Board
 from tdf_jax.sim.bodies import body_of
+from tdf_jax.sim.collision import free_positions
 from tdf_jax.sim.kinematics import kinematics_of
-from tdf_jax.sim.motion import APPROACH, CARRYING, SHORTEST, Failure, _free, plan_motion
+from tdf_jax.sim.motion import APPROACH, CARRYING, SHORTEST, Failure, plan_motion
 from tdf_jax.sim.workcell import OBJECT, build_workcell
 
 PHASES = ["transit", "approach", "grasp", "path", "release", "retreat", "return"]
@@ -162,14 +163,14 @@ def test_near_the_end_of_its_reach_the_arm_leaves_as_far_as_it_can(robot, corner
         return T
 
     starts = robot.home + np.random.default_rng(0).uniform(-np.pi, np.pi, (40, 6))
-    reach = max(x for x in np.arange(0.4, 1.0, 0.005) if any_posture(kinematics, facing(x), starts))
+    reach = max(x for x in np.arange(0.4, 1.0, 0.005) if any_configuration(kinematics, facing(x), starts))
     poses = np.stack([corners[0], facing(reach - 0.04)])
     motion = tdf.plan_joints(tdf.Trajectory.from_matrices(poses), robot)
     retreat = gripper_poses(robot, motion.positions[motion.segment_slices()["retreat"]])
     assert retreat[-1][0, 3] - retreat[0][0, 3] == pytest.approx(SHORTEST * APPROACH, abs=2e-3)
 
 
-def any_posture(kinematics, T, starts):
+def any_configuration(kinematics, T, starts):
     return any(kinematics.search(T, start) is not None for start in starts)
 
 
@@ -184,7 +185,7 @@ def test_the_robot_may_not_overlap_with_itself_and_a_cloud_may_by_a_millimetre()
             return {self.pair: 0.001}
 
     for pair, passes in ((("arm", "hand"), False), (("arm", "arm"), False), (("arm", "target"), True)):
-        assert _free(Overlap(*pair), 0.05)(np.zeros(6)) is passes
+        assert free_positions(Overlap(*pair), 0.05)(np.zeros(6)) is passes
 
 
 @pytest.mark.slow

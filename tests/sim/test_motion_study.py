@@ -1,4 +1,4 @@
-"""The study of the planner: its search for postures against the draws' own, its table, and one task end to end."""
+"""The study of the planner: its search for configurations, its table, and one task end to end."""
 
 import dataclasses
 

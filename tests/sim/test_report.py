@@ -22,7 +22,7 @@ NEVER = Outcome(False, False, False, False, "unreachable", "far", np.nan, np.nan
 def runs():
     outcomes = (GOOD, GOOD, SLACK, FELL, FELL, NEVER, GOOD, GOOD)
     return [
-        Run(CONDITION, number, outcome, number % 3, number % 2, (1.0 + number, 10.0 + number), 2.0)
+        Run(CONDITION, number, outcome, number % 3, number % 2, (1.0 + number, 2.0, 8.0 + number))
         for number, outcome in enumerate(outcomes)
     ]
 
@@ -59,7 +59,7 @@ def test_what_was_not_drawn_is_named_and_not_counted(runs, tmp_path):
     before = rates(runs)
     for number, mesh in ((8, "cup"), (9, "cup")):
         detail = f"draw_episode(): there is no mug_on_rack with cup (episode {number}, seed 3): too thick"
-        runs.append(Run(CONDITION, number, Outcome.failure("not drawn", detail), 0, 1, (0.0, 0.0), 0.0, mesh))
+        runs.append(Run(CONDITION, number, Outcome.failure("not drawn", detail), 0, 1, (0.0, 0.0, 0.0), mesh))
     assert rates(runs) == before and "not drawn" not in causes(runs)
     (words,) = not_drawn(runs)
     assert words == "8, 9: cup: draw_episode(): there is no mug_on_rack with cup (seed 3): too thick"
@@ -91,14 +91,6 @@ def test_a_summary_says_all_of_it(runs):
     assert "  seconds, all episodes: imitation 36.0, planning 16.0, physics 92.0" in text
 
 
-def test_times_that_an_earlier_version_kept_are_unknown(runs, tmp_path):
-    runs[3] = Run(CONDITION, 3, FELL, 0, 1, (4.0, 13.0))
-    made = record(Settings(CONDITION, "mug", None, 7, tmp_path), runs)["seconds"]
-    assert (made["imitation"], made["planning"], made["physics"]) == (36.0, None, None)
-    assert made["episodes"][2:4] == [[3.0, 2.0, 10.0], [4.0, None, None]]
-    assert "  seconds, all episodes: imitation 36.0, planning unknown, physics unknown" in summary(runs)
-
-
 def test_a_record_is_json_whose_seconds_stand_apart(runs, tmp_path):
     settings = Settings(CONDITION, "mug", None, 7, tmp_path)
     made = record(settings, runs)
@@ -107,7 +99,7 @@ def test_a_record_is_json_whose_seconds_stand_apart(runs, tmp_path):
     assert again["episodes"][5]["slip"] is None and again["episodes"][3]["cause"] == "fell"
     assert [one["number"] for one in again["episodes"]] == list(range(8))
     assert again["rates"]["strict"]["rate"] == 0.5 and again["causes"]["fell"] == 2
-    slower = [Run(run.condition, run.number, run.outcome, run.rejected, run.redrawn, (99.0, 99.0), 9.0) for run in runs]
+    slower = [Run(run.condition, run.number, run.outcome, run.rejected, run.redrawn, (99.0, 9.0, 90.0)) for run in runs]
     assert made["seconds"]["episodes"][1] == [2.0, 2.0, 9.0] and made["seconds"]["planning"] == 16.0
     other = record(settings, slower)
     assert {key for key in made if made[key] != other[key]} == {"seconds"}

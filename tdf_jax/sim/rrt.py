@@ -1,4 +1,4 @@
-"""Free motions of an arm from one posture to another: RRT-Connect of the Open Motion Planning Library (OMPL)."""
+"""Free motions of an arm from one configuration to another: RRT-Connect of the Open Motion Planning Library (OMPL)."""
 
 from collections.abc import Callable
 
@@ -22,7 +22,7 @@ def connect(
     seed: int,
     resolution: float = RESOLUTION,
 ) -> Float[np.ndarray, "waypoints joints"] | None:
-    """Find a path of the joints between two postures on which nothing collides.
+    """Find a path of the joints between two configurations on which nothing collides.
 
     Args:
         start: positions of the joints at the start, (joints,), radians.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tdf_jax.sim import transit
-from tdf_jax.sim.transit import connect
+from tdf_jax.sim.rrt import connect
 
 pytest.importorskip("ompl", reason="the extra 'sim' is not installed")
 

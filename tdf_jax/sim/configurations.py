@@ -1,4 +1,4 @@
-"""Postures of an arm: the distinct positions of its joints with which the gripper is at a pose."""
+"""Configurations of an arm: the distinct positions of its joints with which the gripper is at a pose."""
 
 import functools
 import itertools
@@ -11,23 +11,23 @@ from tdf_jax.sim.kinematics import Kinematics
 from tdf_jax.sim.robot import Robot
 
 SEARCHES = 40  # random starts of the search at a pose
-SAME = 0.05  # radians, postures nearer than this are one
+SAME = 0.05  # radians, configurations nearer than this are one
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # about the approach: the same grasp of a parallel gripper
 
 
-class Postures:
-    """The postures of an arm at poses of its gripper, each pose searched once."""
+class Configurations:
+    """The configurations of an arm at poses of its gripper, each pose searched once."""
 
     def __init__(self, kinematics: Kinematics):
         self.kinematics = kinematics
         self._found: dict[bytes, tuple[list[np.ndarray], Iterator[np.ndarray]]] = {}
 
     def at(self, T: Float[np.ndarray, "4 4"]) -> Iterator[Float[np.ndarray, " joints"]]:
-        """Postures at a pose: what is found from home, then from anywhere.
+        """Configurations at a pose: what is found from home, then from anywhere.
 
-        If the postures at the pose half a turn about the approach away are known, they are tried first with the last
-        joint turned by half a turn. Where that joint turns the gripper about its approach and every one of them can
-        turn so far, there are no others.
+        If the configurations at the pose half a turn about the approach away are known, they are tried first, with the
+        last joint turned by half a turn. Where that joint turns the gripper about its approach and every one of them
+        can turn so far, there are no others.
 
         Args:
             T: pose of the gripper's frame, 4x4, metres, world frame.
@@ -84,7 +84,7 @@ def _key(T: np.ndarray) -> bytes:
 
 
 def _near(robot: Robot, joints: np.ndarray) -> np.ndarray:
-    """The same posture, with whole turns of the joints towards home where the limits allow it."""
+    """The same configuration, with whole turns of the joints towards home where the limits allow it."""
     turns = np.round((joints - robot.home) / (2 * np.pi))
     moved = joints - 2 * np.pi * turns
     return np.where((moved >= robot.lower) & (moved <= robot.upper), moved, joints)
