@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tdf_jax.sim import transit
+from tdf_jax.sim import rrt
 from tdf_jax.sim.rrt import connect
 
 pytest.importorskip("ompl", reason="the extra 'sim' is not installed")
@@ -54,7 +54,7 @@ def test_limits_are_held():
 
 
 def test_no_way_is_none(monkeypatch):
-    monkeypatch.setattr(transit, "MAX_ITERATIONS", 200)
+    monkeypatch.setattr(rrt, "MAX_ITERATIONS", 200)
     assert connect(START, GOAL, *LIMITS, lambda joints: abs(joints[0]) > 0.3, 1) is None
 
 
