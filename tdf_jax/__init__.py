@@ -105,7 +105,7 @@ from tdf_jax.perception.support import remove_plane as remove_plane
 from tdf_jax.planning.avoidance import ClearanceConfig as ClearanceConfig, push_clear as push_clear
 from tdf_jax.planning.distances import clearance as clearance
 from tdf_jax.planning.occupied import field_obstacle as field_obstacle
-from tdf_jax.relation import relate as relate
+from tdf_jax.relation.object_motion import relate as relate
 from tdf_jax.shapes import (
     BottleParameters as BottleParameters,
     BowlParameters as BowlParameters,

@@ -22,7 +22,8 @@ from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.field import with_decoder_of
 from tdf_jax.networks.model import Model
-from tdf_jax.relation import Objects, carry_object, check_scene, kept_points, reference_of, target_field
+from tdf_jax.relation.placed_path import carry_object
+from tdf_jax.relation.two_objects import Objects, check_scene, kept_points, reference_of, target_field
 from tdf_jax.solvers.adam import OptimizeConfig, optimize
 from tdf_jax.solvers.initial import default_goal
 from tdf_jax.solvers.multistart import SolveConfig, solve

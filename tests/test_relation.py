@@ -12,12 +12,12 @@ import pytest
 from conftest import QUERIES, carried, composed, random_cloud, random_poses
 
 import tdf_jax as tdf
-from tdf_jax import relation
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.relation_success import judge
 from tdf_jax.evaluation.relation_tasks import demonstrate, draw_pair, place_pair
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.transport import BEYOND, NEAR, arrival_depth, arrival_of, carry_to_target
+from tdf_jax.relation import object_motion, regions, two_objects
 from tdf_jax.uncertainty.calibration import ONE_NETWORK_CURVES, TARGET_CURVES
 
 KEY = jax.random.key(3)
@@ -132,7 +132,7 @@ def test_a_network_of_a_target_that_stands_where_it_stood_seats_the_object(small
         seen.append(target)
         return np.full(len(motions), 0.004)
 
-    monkeypatch.setattr("tdf_jax.relation.touch_distances", touch)
+    monkeypatch.setattr("tdf_jax.relation.object_motion.touch_distances", touch)
     reference = tdf.describe(small_model, related, target_model=small_model)
     reference = dataclasses.replace(reference, contact=dataclasses.replace(reference.contact, touch=jnp.zeros(())))
     options = {"points": moved[0], "key": KEY, "config": SEARCH}
@@ -148,11 +148,11 @@ def test_a_network_of_a_target_that_stands_where_it_stood_seats_the_object(small
 def test_motions_that_do_not_touch_the_target_are_left_out_where_others_do(monkeypatch, distances, kept):
     poses = np.tile(np.float32([1, 0, 0, 0, 0, 0, 0]), (4, 1))
     poses[:, 4] = range(4)
-    found = relation.Relations(poses, poses, np.arange(4.0), np.full((4, 3), np.nan, np.float32), 0.1)
+    found = object_motion.Relations(poses, poses, np.arange(4.0), np.full((4, 3), np.nan, np.float32), 0.1)
     contact = cast(Any, SimpleNamespace(touch=0.0, target_points=np.zeros((1, 3)), down=jnp.array([0.0, 0.0, -1.0])))
-    objects = relation.Objects(np.zeros((1, 3)), None, cast(Any, None), None)
-    monkeypatch.setattr(relation, "touch_distances", lambda *_: np.array(distances))
-    seated = relation._seated(objects, found, contact)
+    objects = two_objects.Objects(np.zeros((1, 3)), None, cast(Any, None), None)
+    monkeypatch.setattr(object_motion, "touch_distances", lambda *_: np.array(distances))
+    seated = object_motion._seated(objects, found, contact)
     np.testing.assert_array_equal(seated.energies, np.arange(4.0)[list(kept)])
     np.testing.assert_array_equal(seated.target_contacts, poses[list(kept)])
     np.testing.assert_array_equal(seated.object_contacts, poses[list(kept)])
@@ -183,9 +183,9 @@ def test_along_a_rod_the_nearest_place_is_taken_where_the_object_is_free_of_the_
             return jax.nn.sigmoid(2000 * (0.02 - jnp.linalg.norm(x - jnp.array([centre, 0.0, -0.03]), axis=-1)))
 
         points = np.concatenate([rod(), post])
-        objects = relation.Objects(points, points, cast(Any, SimpleNamespace(occupancy=occupancy)), None)
+        objects = two_objects.Objects(points, points, cast(Any, SimpleNamespace(occupancy=occupancy)), None)
         above = np.float32([[1, 0, 0, 0, 0, 0, 0.012]])
-        found[name] = relation._registered(above, np.float32([1, 0, 0, 0, 0, 0, 0]), objects, contact)[0]
+        found[name] = regions.registered_contacts(above, np.float32([1, 0, 0, 0, 0, 0, 0]), objects, contact)[0]
     assert np.abs(found["free"][4:]).max() < 0.004  # on the rod's axis, where it was along it
     moved = found["in the post"][4:] - found["free"][4:]
     assert 0.009 < moved[0] < 0.02 and np.abs(moved[1:]).max() < 0.004

@@ -36,7 +36,7 @@ from tdf_jax.imitation import imitate
 from tdf_jax.networks.checkpoint import load_model
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.model import Model
-from tdf_jax.relation import distinct_contacts
+from tdf_jax.relation.regions import distinct_contacts
 from tdf_jax.shapes import FAMILIES
 from tdf_jax.solvers.pick import CarryConfig
 from tdf_jax.uncertainty.calibration import CURVES, TARGET_CURVES, logistic, ranking, recognition, surface_logit

@@ -26,7 +26,8 @@ from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.model import Model, fingerprint
-from tdf_jax.relation import Objects, Relations, find_relations, kept_points
+from tdf_jax.relation.object_motion import Relations, find_relations
+from tdf_jax.relation.two_objects import Objects, kept_points
 from tdf_jax.solvers.pick import CarryConfig
 
 FORMAT = 12  # format number; raise it when the computation of a placement or of its verdict changes

@@ -18,7 +18,8 @@ from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.field import DescriptorField
 from tdf_jax.networks.model import Model
-from tdf_jax.relation import OBJECT_STREAM, TARGET_STREAM, distinct_contacts
+from tdf_jax.relation.object_motion import OBJECT_STREAM, TARGET_STREAM
+from tdf_jax.relation.regions import distinct_contacts
 from tdf_jax.solvers.pick import CarryConfig, carry
 
 # A cloud of one side of an object is smaller than the object, and its box in another orientation is larger.

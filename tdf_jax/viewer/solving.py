@@ -23,7 +23,7 @@ from tdf_jax.networks.encoding import encode
 from tdf_jax.networks.field import DescriptorField
 from tdf_jax.networks.model import Model, fingerprint
 from tdf_jax.networks.surface import surface_triangles
-from tdf_jax.relation import deeper_arrival, dense
+from tdf_jax.relation.placed_path import deeper_arrival, dense
 from tdf_jax.solvers.imitation_scene import ImitationScene
 from tdf_jax.solvers.pick import carry
 from tdf_jax.solvers.result import Result
