@@ -18,6 +18,7 @@ from tdf_jax._internal.precision import full_precision
 from tdf_jax.energy.losses import pose_difference
 from tdf_jax.energy.reference import Reference
 from tdf_jax.geometry import se3
+from tdf_jax.networks.field import DescriptorField
 
 LARGEST_ROTATION, LARGEST_TRANSLATION = 0.7, 0.05  # bounds of one step, radians and metres
 DAMPINGS = 1e-3, 1e3  # bounds of the damping
@@ -223,12 +224,7 @@ def _match(R, centroid, field, query, weights, demonstrated):
     """Weighted sum over query points of the mean absolute difference of descriptors, its gradient and its curvature."""
     arm = se3.rotate(R, query)
     x = (arm + centroid[:, None]).reshape(-1, 3)
-
-    def along(axis):
-        return jax.jvp(field.descriptors, (x,), (jnp.broadcast_to(axis, x.shape),))
-
-    # (points, channels), (points, 3, channels)
-    found, tangents = jax.vmap(along, out_axes=(None, 1))(jnp.eye(3, dtype=x.dtype))
+    found, tangents = descriptors_and_derivatives(field, x)
     residual = found - demonstrated.reshape(found.shape)
     size = jnp.abs(residual)
     mean = jnp.mean(size, axis=-1)
@@ -245,6 +241,22 @@ def _match(R, centroid, field, query, weights, demonstrated):
     gradient = jnp.einsum("pqai,pqi->pa", jacobian, slope)
     hessian = jnp.einsum("pqai,pqbi->pab", jacobian, jacobian @ curvature)
     return jnp.sum((weights * mean).reshape(arm.shape[:2]), axis=1), gradient, hessian
+
+
+def descriptors_and_derivatives(
+    field: DescriptorField, x: Float[Array, "points 3"]
+) -> tuple[Float[Array, "points channels"], Float[Array, "points 3 channels"]]:
+    """Descriptors at points, and their derivatives along the three axes.
+
+    Args:
+        field: descriptor field.
+        x: points, (points, 3), metres, world frame.
+    """
+
+    def along(axis):
+        return jax.jvp(field.descriptors, (x,), (jnp.broadcast_to(axis, x.shape),))
+
+    return jax.vmap(along, out_axes=(None, 1))(jnp.eye(3, dtype=x.dtype))
 
 
 def _prior(R, centroid, target, origin, centre, energy):

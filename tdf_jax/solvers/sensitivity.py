@@ -24,6 +24,7 @@ from tdf_jax._internal.precision import full_precision
 from tdf_jax.energy.reference import Reference
 from tdf_jax.geometry import se3
 from tdf_jax.networks.field import DescriptorField
+from tdf_jax.solvers.gauss_newton import descriptors_and_derivatives
 from tdf_jax.solvers.initial import check_channels
 
 # Directions whose curvature is below this share of the stiffest one's are free, as in `pose_covariance`.
@@ -179,15 +180,9 @@ def _model(field, query, demonstrated, pick):
     scale = jnp.sqrt(jnp.mean(jnp.sum(arm**2, axis=-1)))
     # Coincident query points determine no rotation: its curvature is zero, whatever a rotation counts as.
     scale = jnp.where(scale > 0, scale, SCALE)
-    x = se3.transform(pick, query)
-
-    def along(axis):
-        return jax.jvp(field.descriptors, (x,), (jnp.broadcast_to(axis, x.shape),))
-
-    identity = jnp.eye(3, dtype=x.dtype)
-    found, tangents = jax.vmap(along, out_axes=(None, 1))(identity)  # (queries, channels), (queries, 3, channels)
+    found, tangents = descriptors_and_derivatives(field, se3.transform(pick, query))
     residual = found - demonstrated
-    across = jnp.cross(identity[None], arm[:, None])
+    across = jnp.cross(jnp.eye(3, dtype=found.dtype)[None], arm[:, None])
     jacobian = jnp.concatenate([jnp.einsum("qai,qic->qac", across, tangents), scale * tangents], axis=1)
     size = jnp.abs(residual)
     weighted = jacobian / jnp.maximum(jnp.maximum(size, jnp.mean(size, axis=-1, keepdims=True)), 1e-9)[:, None]

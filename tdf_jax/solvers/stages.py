@@ -223,10 +223,11 @@ def found_candidates(xp, stage, state, plan):
     def grid(part):
         return part[: math.prod(shape)].reshape(*shape, *part.shape[1:])
 
-    return Candidates(grid(state.R), grid(state.centroid), grid(_finite(xp, state.values[:, -1])))
+    return Candidates(grid(state.R), grid(state.centroid), grid(infinite_unless_finite(xp, state.values[:, -1])))
 
 
-def _finite(xp, energies):
+def infinite_unless_finite(xp, energies):
+    """Energies, infinite where they are NaN, so that no candidate without an energy is the best."""
     return xp.where(xp.isfinite(energies), energies, xp.inf)
 
 
@@ -285,7 +286,7 @@ def finish(xp, state, stages, initial, problem, plan):
         """Energies (rows, columns, times) during a stage."""
         rows, columns = plan.shape(stage)
         energies = values[stage][: rows * columns, : plan.num_steps(stage) + 1]
-        return _finite(xp, energies).reshape(rows, columns, -1)
+        return infinite_unless_finite(xp, energies).reshape(rows, columns, -1)
 
     def best(stage, *others):
         """Energies (candidates, times) of the best candidates of each waypoint; those of `others` are constant."""
@@ -294,7 +295,7 @@ def finish(xp, state, stages, initial, problem, plan):
         ordered = xp.sort(xp.concatenate(rows), axis=0)
         return ordered[np.minimum(np.arange(kept), len(ordered) - 1)].sum(axis=1)
 
-    fixed = _finite(xp, values["polish"][kept * free : kept * free + n - free, -1]).sum()
+    fixed = infinite_unless_finite(xp, values["polish"][kept * free : kept * free + n - free, -1]).sum()
     curves = [best(stage) for stage in plan.stages[:-1] if free == 1 or stage not in ("coarse", "prune", "propagate")]
     if free > 1:
         curves.insert(1, best("propagate", course("search")[:, :, -1:]))

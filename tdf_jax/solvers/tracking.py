@@ -37,6 +37,7 @@ from tdf_jax.solvers import gauss_newton
 from tdf_jax.solvers.initial import check_channels, default_goal
 from tdf_jax.solvers.pick import pick_of
 from tdf_jax.solvers.result import Result, with_ends
+from tdf_jax.solvers.stages import infinite_unless_finite
 
 GOLDEN = (np.sqrt(5) - 1) / 2
 DAMPINGS = 0.3, 0.03  # of the first step of refine and of polish
@@ -240,7 +241,7 @@ def _tracked(last, origin, latent, rotation, tolerance, field, pick, *, sizes) -
 def _track(last, origin, latent, rotation, tolerance, field, pick, *, sizes):
     problem = gauss_newton.in_blocks(pick, *_evenly(len(pick.query), sizes.coarse_queries))
     R, centroid = _starts(last, origin, latent, rotation, field, problem, sizes.rotations)
-    values = _finite(_energies(R, centroid, field, problem))
+    values = infinite_unless_finite(jnp, _energies(R, centroid, field, problem))
     chosen = jnp.argsort(values)[: sizes.candidates]
     # Both stages run one program: polish moves the first candidate only, but has room for as many.
     steps = np.array([sizes.refine_steps, sizes.polish_steps], np.int32)
@@ -254,7 +255,9 @@ def _track(last, origin, latent, rotation, tolerance, field, pick, *, sizes):
             *state, jnp.zeros(sizes.candidates, jnp.int32), bounds, damping, tolerance, field, problem, energy,
             length=int(steps.max()) + 1, chunk=devices.points_at_a_time(sizes.coarse_queries),
         )  # fmt: skip
-        course = jnp.where((jnp.arange(sizes.candidates) < bounds[0])[:, None], _finite(course), jnp.inf)
+        course = jnp.where(
+            (jnp.arange(sizes.candidates) < bounds[0])[:, None], infinite_unless_finite(jnp, course), jnp.inf
+        )
         order = jnp.argsort(course[:, -1])
         return [part[order] for part in ended], (course, order)
 
@@ -312,7 +315,3 @@ def _energies(R, centroid, field, problem):
     x = se3.rotate(R, problem.query[0]) + centroid[:, None]
     share = problem.weights[0] / jnp.sum(problem.weights[0])
     return jnp.mean(jnp.abs(field.descriptors(x) - problem.descriptors[0, 0]), axis=-1) @ share
-
-
-def _finite(energies):
-    return jnp.where(jnp.isfinite(energies), energies, jnp.inf)
