@@ -77,7 +77,6 @@ def test_picks_that_find_nothing_end_in_a_line(monkeypatch, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--picks", "0"], "--picks: 0 is given; expected at least 1"),
         (["--weights", "multi"], "--category is not given"),
         (["--weights", "none", "--category", "mug"], "none"),
     ],

@@ -52,14 +52,6 @@ def test_an_interrupted_study_goes_on(monkeypatch, tmp_path, capsys):
     assert "| latent | 2 % | 1.00 mm | 10 % | 10 % | 10 % |  |" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("words", [["--pairs", "0"], ["--seed", "-1"], []])
-def test_bad_settings_are_refused(words, tmp_path):
-    out = ["--out", str(tmp_path)] if words else []
-    with pytest.raises(SystemExit) as stopped:
-        main([*words, *out])
-    assert stopped.value.code == 2
-
-
 @pytest.mark.slow
 def test_derivatives_on_a_mug_agree_with_picks_that_are_found_again():
     pair = measure(load_model("mug"), "mug", 870, 0)

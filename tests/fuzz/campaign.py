@@ -40,26 +40,21 @@ def library_case(seed: int, number: int, world: World, folder: Path) -> Case:
 
 def run_library(seed: int, number: int, world: World) -> dict:
     """Make and judge a case in a new folder."""
-    folder = Path(tempfile.mkdtemp(prefix="case-", dir=world.folder))
-    began = time.perf_counter()
-    try:
-        case = library_case(seed, number, world, folder)
-        verdict, happened = judge(case, folder)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-    seconds = round(time.perf_counter() - began, 3)
-    happened = happened.replace(str(folder), "FOLDER")
-    return {"case": number, "kind": case.kind, "text": case.text, "verdict": verdict, "happened": happened,
-    "seconds": seconds}  # fmt: skip
+    return _judged(number, world, lambda folder: library_case(seed, number, world, folder), judge)
 
 
 def run_command(seed: int, number: int, world: World) -> dict:
     """Make and judge a case of the command line, in a new folder."""
+    rng = np.random.default_rng([seed, number, 1])
+    return _judged(number, world, lambda folder: commands.command_case(rng, world, folder), commands.judge_command)
+
+
+def _judged(number: int, world: World, make: Callable, judge_case: Callable) -> dict:
     folder = Path(tempfile.mkdtemp(prefix="case-", dir=world.folder))
     began = time.perf_counter()
     try:
-        case = commands.command_case(np.random.default_rng([seed, number, 1]), world, folder)
-        verdict, happened = commands.judge_command(case, folder)
+        case = make(folder)
+        verdict, happened = judge_case(case, folder)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     seconds = round(time.perf_counter() - began, 3)
