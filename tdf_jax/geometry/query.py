@@ -135,7 +135,7 @@ def contact_query(
         spread: standard deviation of the query points about a middle, metres.
 
     Returns:
-        Query points, (count, 3), metres, world frame: contact points for a target whose contact frame is the world.
+        Query points, (count, 3), metres, world frame, the contact points for a target whose contact frame is the world.
 
     Raises:
         InputError: a cloud is not a point cloud, the clouds are farther apart than a quarter of the larger one's

@@ -41,8 +41,8 @@ def load_points(
             instead of refusing them. The other rows keep their order.
 
     Returns:
-        Point cloud, (points, 3), metres, in the frame of the file: float32, or float64 if rounding to float32 would
-        move a coordinate by more than 0.01 mm, as in map coordinates.
+        Point cloud, (points, 3), metres, in the frame of the file. It is float32, or float64 if rounding to float32
+        would move a coordinate by more than 0.01 mm, as in map coordinates.
 
     Raises:
         InputError: the file is missing, unreadable or of another format, or its points are not a point cloud, or they

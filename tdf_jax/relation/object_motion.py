@@ -92,8 +92,8 @@ def relate(
         config: settings of the search on both objects.
 
     Returns:
-        The motion M of the object, `wxyz_xyz`, (7,), metres, world frame: a point x of the object in its initial
-            pose ends at M x.
+        The motion M of the object, `wxyz_xyz`, (7,), metres, world frame. A point x of the object in its initial pose
+        ends at M x.
 
     Raises:
         InputError: bad clouds, clouds of one object, a demonstration without a target, no target points where the

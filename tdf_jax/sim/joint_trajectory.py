@@ -202,7 +202,7 @@ class JointTrajectory:
                 too. None writes all samples.
 
         Returns:
-            The text: positions in radians and velocities in radians per second, to 1e-9; 0 velocity at the last point.
+            The text, with positions in radians and velocities in radians per second, to 1e-9; at the last point 0.
 
         Raises:
             InputError: seconds is not positive, or two samples are in the same nanosecond.

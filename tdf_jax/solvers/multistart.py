@@ -159,7 +159,7 @@ def solve(
 
     Returns:
         The result. Candidate k consists of the k-th best pose of each waypoint. `initial_trajectories` holds all
-            starts. In a traced call `history` is infinite, not NaN, where a start is not followed.
+        starts. In a traced call `history` is infinite, not NaN, where a start is not followed.
 
     Raises:
         InputError: as for `optimize`, or a weight on eq. 6, which couples the waypoints, or a traced one.

@@ -115,8 +115,8 @@ def track(
         config: settings.
 
     Returns:
-        The result, with one candidate: the pick with its trajectory. Its energy is that of the pick's descriptors;
-            `initial_trajectories` holds all starts, and `history` follows those that are refined.
+        The result, whose one candidate is the pick with its trajectory. Its energy is that of the pick's descriptors;
+        `initial_trajectories` holds all starts, and `history` follows those that are refined.
 
     Raises:
         InputError: the last result is lost, is of another demonstration or of a solver that finds no pick by its
