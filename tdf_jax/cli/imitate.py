@@ -316,7 +316,7 @@ def _record(
         **({} if camera is None else {"camera": camera}),
         "status": result.status,
         "best": result.best,
-        "loss": {"start": float(result.candidate_history[result.best, 0]), "end": result.loss},
+        "loss": {"start": float(np.asarray(result.candidate_history)[result.best, 0]), "end": result.loss},
         "confidence": _plain(float(result.confidence)),
         "recognised": _plain(float(result.recognised)),
         "advice": result.advice or None,

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from tdf_jax._internal.devices import quickly_compiled
 from tdf_jax.evaluation.annotated_meshes import AnnotatedMesh
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.symmetry import equivalent
@@ -38,9 +39,15 @@ def expected_trajectory(
     Returns:
         T_world_query on object b.
     """
-    pick_motion = jnp.asarray(T_world_place_b @ np.linalg.inv(T_world_place_a), demonstrated.wxyz_xyz.dtype)
+    pick_motion = (T_world_place_b @ np.linalg.inv(T_world_place_a)).astype(demonstrated.wxyz_xyz.dtype)
+    return _expected(demonstrated, pick_motion, goal)
+
+
+@quickly_compiled
+def _expected(demonstrated, pick_motion, goal):
+    # In one program: operation by operation, the first call of a process would compile thirty.
     pick = se3.compose(se3.pose(pick_motion[:3, :3], pick_motion[:3, 3]), demonstrated.wxyz_xyz[0])
-    return carry_trajectory(demonstrated, pick, jnp.asarray(goal))
+    return carry_trajectory(demonstrated, pick, goal)
 
 
 def nearest_place(
@@ -85,9 +92,14 @@ def pose_error(
         estimate: estimated poses `wxyz_xyz`, (..., 7).
         truth: true poses `wxyz_xyz`, (..., 7); batch axes broadcast.
     """
-    estimate, truth = jnp.asarray(estimate), jnp.asarray(truth)
-    distance = jnp.linalg.norm(se3.translation(estimate) - se3.translation(truth), axis=-1)
-    return np.asarray(distance), np.asarray(se3.rotation_distance(se3.rotation(estimate), se3.rotation(truth)))
+    distance, angle = _distances(estimate, truth)
+    return np.asarray(distance), np.asarray(angle)
+
+
+@quickly_compiled
+def _distances(a, b):
+    distance = jnp.linalg.norm(se3.translation(a) - se3.translation(b), axis=-1)
+    return distance, se3.rotation_distance(se3.rotation(a), se3.rotation(b))
 
 
 def path_error(estimate: Trajectory, truth: Trajectory) -> float:

@@ -3,11 +3,11 @@
 import dataclasses
 from typing import TYPE_CHECKING
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from tdf_jax.evaluation.metrics import expected_trajectory, nearest_place
+from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory
 
@@ -49,11 +49,10 @@ class Scene:
         if self.T_world_places is None:
             return None
         demonstrated, (place_a, place_b) = self.demonstration.trajectory, self.T_world_places
-        if pick is not None:
-            estimate = (
-                np.asarray(Trajectory(jnp.asarray(pick)[None]).matrices[0])
-                @ np.linalg.inv(demonstrated.matrices[0])
-                @ place_a
+        if pick is not None and (self.fold != 1 or self.others):
+            T_world_demonstrated, T_world_pick = np.asarray(
+                se3.matrix(np.stack([demonstrated.wxyz_xyz[0], pick]).astype(demonstrated.wxyz_xyz.dtype))
             )
+            estimate = T_world_pick @ np.linalg.inv(T_world_demonstrated) @ place_a
             place_b = nearest_place(self.T_world_target, estimate, place_b, self.fold, self.others)
         return expected_trajectory(demonstrated, place_a, place_b, goal)

@@ -154,8 +154,8 @@ class Demonstration:
                 f"Demonstration(): the query points have a diagonal of {size:.3g} m, and the cloud one of "
                 f"{diagonal:.3g} m; expected a part of the object. If they are in millimetres, multiply by 0.001"
             )
-        grasp = jnp.asarray(self.trajectory.wxyz_xyz)[self._first]
-        carried = np.asarray(se3.transform(grasp, jnp.asarray(query)), np.float64)
+        grasp = np.asarray(self.trajectory.wxyz_xyz)[self._first]
+        carried = np.asarray(se3.transform(grasp, query.astype(grasp.dtype)), np.float64)
         low, high = cloud.min(axis=0), cloud.max(axis=0)
         gap = np.linalg.norm(np.maximum(0, np.maximum(low - carried, carried - high)), axis=1).min()
         if gap > FARTHEST_QUERY * diagonal:

@@ -226,6 +226,20 @@ def pose(R: Float[Array, "... 3 3"], t: Float[Array, "... 3"]) -> Float[Array, "
     return _join(wxyz_from_matrix(R), t)
 
 
+@jax.jit
+def matrix(wxyz_xyz: Float[Array, "... 7"]) -> Float[Array, "... 4 4"]:
+    """Compute the homogeneous matrices of poses `wxyz_xyz`, (..., 4, 4), translations in metres."""
+    upper = jnp.concatenate([rotation(wxyz_xyz), translation(wxyz_xyz)[..., None]], axis=-1)
+    lower = jnp.broadcast_to(jnp.array([0, 0, 0, 1], upper.dtype), (*upper.shape[:-2], 1, 4))
+    return jnp.concatenate([upper, lower], axis=-2)
+
+
+@jax.jit
+def shift(wxyz_xyz: Float[Array, "... 7"], offset: Float[Array, "... 3"]) -> Float[Array, "... 7"]:
+    """Add an offset, (..., 3), to the translations of poses `wxyz_xyz`, (..., 7), metres."""
+    return jnp.concatenate([wxyz_xyz[..., :4], translation(wxyz_xyz) + offset], axis=-1)
+
+
 def rotation(wxyz_xyz: Float[Array, "... 7"]) -> Float[Array, "... 3 3"]:
     """Return the rotation matrices of poses `wxyz_xyz`, (..., 3, 3)."""
     return matrix_from_wxyz(wxyz_xyz[..., :4])

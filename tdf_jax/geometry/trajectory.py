@@ -66,9 +66,7 @@ class Trajectory:
     @public
     def matrices(self) -> Float[Array, "poses 4 4"]:
         """Homogeneous matrices, (poses, 4, 4)."""
-        upper = jnp.concatenate([self.rotations, self.translations[..., None]], axis=-1)
-        lower = jnp.broadcast_to(jnp.array([0, 0, 0, 1], upper.dtype), (*upper.shape[:-2], 1, 4))
-        return jnp.concatenate([upper, lower], axis=-2)
+        return se3.matrix(self.wxyz_xyz)
 
     @classmethod
     @public
@@ -133,8 +131,8 @@ class Trajectory:
         Raises:
             InputError: the offset is not three finite numbers, or farther than float32 resolves.
         """
-        vector = jnp.asarray(checks.vector("Trajectory.shifted()", "offset", offset), self.wxyz_xyz.dtype)
-        return Trajectory(jnp.concatenate([self.wxyz_xyz[..., :4], self.translations + vector], axis=-1))
+        vector = checks.vector("Trajectory.shifted()", "offset", offset).astype(self.wxyz_xyz.dtype)
+        return Trajectory(se3.shift(self.wxyz_xyz, vector))
 
     def displaced(self, offset: ArrayLike, where: Literal["start", "goal"] = "goal") -> "Trajectory":
         """Displace one end of the trajectory, as `displace` does.

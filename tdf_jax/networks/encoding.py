@@ -120,7 +120,10 @@ def encode(
         return (field, np.ones(len(cloud), bool)) if return_kept else field
     if checks.traced(model.params):
         return _encoded(model, cloud, num_subsamples, clean, return_kept)
-    # A known cloud is encoded while a function that uses it is traced: whether its points are foreign is computed.
+    if not checks.tracing():
+        return _encoded(model, cloud, num_subsamples, clean, return_kept)
+    # A known cloud is encoded while a function that uses it is traced: whether its points are foreign is computed. Not
+    # otherwise, because the context also evaluates every constant of the programs, one by one.
     with jax.ensure_compile_time_eval():
         return _encoded(model, cloud, num_subsamples, clean, return_kept)
 

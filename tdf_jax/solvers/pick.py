@@ -141,9 +141,12 @@ def carry(
         progress=progress,
         device_mesh=device_mesh,
     )
-    # Candidates and starts go through one program.
-    picks = jnp.concatenate([result.trajectories[:, 0], result.initial_trajectories[:, 0]])
-    trajectories = carry_to_picks(reference.trajectory, picks, goal)
+    # Candidates and starts go through one program. Outside of a trace they are joined and parted on the host: each
+    # operation on an array of JAX would be a program to compile.
+    xp = jnp if checks.traced(result.trajectories) else np
+    found, starts = xp.asarray(result.trajectories), xp.asarray(result.initial_trajectories)
+    picks = xp.concatenate([found[:, 0], starts[:, 0]])
+    trajectories = xp.asarray(carry_to_picks(reference.trajectory, picks, goal))
     count = len(result.trajectories)
     if checks.traced(result.energies, reference.descriptors):
         residual = traced_pick_residual(jnp.min(result.energies), pick.descriptors[0])
@@ -152,8 +155,8 @@ def carry(
         residual = np.asarray(residual, result.energies.dtype)
     result = dataclasses.replace(
         result,
-        trajectories=trajectories[:count],
-        initial_trajectories=trajectories[count:],
+        trajectories=jnp.asarray(trajectories[:count]),
+        initial_trajectories=jnp.asarray(trajectories[count:]),
         residual=residual,
         origin=field.origin,
         latent=field.latent,

@@ -185,8 +185,10 @@ class Result:
     @public
     def trajectory(self) -> Trajectory:
         """The best trajectory, T_world_query."""
-        index = jnp.asarray(self.best)[..., None, None, None]
-        return Trajectory(jnp.take_along_axis(jnp.asarray(self.trajectories), index, axis=-3)[..., 0, :, :])
+        xp = self._numpy
+        index = xp.asarray(self.best)[..., None, None, None]
+        best = xp.take_along_axis(xp.asarray(self.trajectories), index, axis=-3)[..., 0, :, :]
+        return Trajectory(jnp.asarray(best))
 
     @property
     @public
@@ -216,7 +218,8 @@ class Result:
     @public
     def loss(self) -> float | Float[Array | np.ndarray, "*batch"]:
         """Energy of the best trajectory; a Python float outside a trace, unless there is a batch."""
-        loss = jnp.take_along_axis(jnp.asarray(self.energies), jnp.asarray(self.best)[..., None], axis=-1)[..., 0]
+        xp = self._numpy
+        loss = xp.take_along_axis(xp.asarray(self.energies), xp.asarray(self.best)[..., None], axis=-1)[..., 0]
         return loss if checks.traced(loss) or loss.ndim else float(loss)
 
     @property

@@ -267,6 +267,14 @@ def test_clouds_of_many_sizes_run_one_program_and_what_fills_them_up_does_not_co
         np.testing.assert_allclose(traced.latent, field.latent, atol=5e-6 * np.abs(plain).max())
 
 
+def test_a_first_encoding_compiles_one_program_and_none_of_its_constants(small_model):
+    cloud = random_cloud(0, 2300).astype(np.float32)  # of a size that no other test has, so nothing is compiled yet
+    with compilations() as names:
+        tdf.encode(small_model, cloud, num_subsamples=0)
+    asks_for_a_trace = "jit(convert_element_type)"  # once a process
+    assert [name for name in names if name != asks_for_a_trace] == ["jit(_encode)"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["small_model", "subsampling_model"])
 def test_the_latent_has_a_gradient_with_respect_to_the_parameters(model, request):
