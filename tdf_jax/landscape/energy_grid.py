@@ -18,6 +18,7 @@ from tdf_jax.geometry.grid import Grid
 from tdf_jax.landscape import shared_lattice
 from tdf_jax.landscape.storage import TEMPERATURE, Landscape, check_reduction
 from tdf_jax.networks.field import DescriptorField
+from tdf_jax.solvers.initial import check_channels
 
 OVER_ROTATIONS = ("best", "each")
 
@@ -86,12 +87,7 @@ def blank(
     temperature: float = TEMPERATURE,
 ) -> Landscape:
     """Make a landscape whose energies are all NaN, for `fill`; see `energy_landscape` for the arguments."""
-    channels = field.conditioned.config.channels
-    if reference.descriptors.shape[-1] != channels:
-        raise InputError(
-            f"energy_landscape(): the reference has {reference.descriptors.shape[-1]} channels and the field "
-            f"{channels}; expected both from the same model"
-        )
+    check_channels("energy_landscape()", field, reference)
     checks.choice("energy_landscape()", "over_rotations", over_rotations, OVER_ROTATIONS)
     rotations = np.asarray(np.eye(3) if rotation is None else rotation, dtype=float)
     if rotations.shape[-2:] != (3, 3) or rotations.ndim not in (2, 3) or not len(rotations):
