@@ -206,21 +206,21 @@ def _contact(demonstrations, fields, model, target_model, combine) -> Contact | 
     T_world_contact = jnp.asarray(first.T_world_contact, on_object.dtype)
     arrival = arrival_of(demonstrations[0])
     return Contact(
-        query,
-        _combined(seen, combine),
-        described,
-        on_object,
-        on_target,
-        T_world_contact,
-        jnp.asarray(first.points, on_object.dtype),
-        -se3.rotation(T_world_contact)[2],
-        jnp.asarray(_touch(demonstrations, fields, target_fields), on_object.dtype),
-        jnp.asarray(arrival.length, on_object.dtype),
-        jnp.asarray(arrival.outward, on_object.dtype) @ se3.rotation(T_world_contact),
-        jnp.asarray(arrival.depth, on_object.dtype),
-        jnp.asarray(_target_logits(targets, target_fields, model, target_model), on_object.dtype),
-        _num_different(targets),
-        None if target_model is None else target_model.info,
+        query=query,
+        object_descriptors=_combined(seen, combine),
+        target_descriptors=described,
+        T_object_contact=on_object,
+        T_target_contact=on_target,
+        T_world_contact=T_world_contact,
+        target_points=jnp.asarray(first.points, on_object.dtype),
+        down=-se3.rotation(T_world_contact)[2],
+        touch=jnp.asarray(_touch(demonstrations, fields, target_fields), on_object.dtype),
+        arrival=jnp.asarray(arrival.length, on_object.dtype),
+        outward=jnp.asarray(arrival.outward, on_object.dtype) @ se3.rotation(T_world_contact),
+        depth=jnp.asarray(arrival.depth, on_object.dtype),
+        target_logits=jnp.asarray(_target_logits(targets, target_fields, model, target_model), on_object.dtype),
+        num_targets=_num_different(targets),
+        target_info=None if target_model is None else target_model.info,
     )
 
 
