@@ -23,6 +23,7 @@ from tdf_jax._internal.files import replace_file
 from tdf_jax.energy.losses import EnergyWeights
 from tdf_jax.energy.reference import Reference, describe
 from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, mug_case, place_demonstration
+from tdf_jax.evaluation.study_command import at_least
 from tdf_jax.geometry.paths import SHAPES
 from tdf_jax.geometry.query import box_query
 from tdf_jax.networks.checkpoint import load_model
@@ -141,10 +142,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--pairs", type=int, default=50, help="number of pairs (default: 50)")
-    parser.add_argument("--first", type=int, default=0, help="number of the first pair (default: 0)")
-    parser.add_argument("--rows", type=int, default=len(PAPER), help="number of rows of table 1 (default: 9, all)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the starts (default: 0)")
+    parser.add_argument("--pairs", type=at_least(0), default=50, help="number of pairs (default: 50)")
+    parser.add_argument("--first", type=at_least(0), default=0, help="number of the first pair (default: 0)")
+    parser.add_argument(
+        "--rows", type=at_least(0), default=len(PAPER), help="number of rows of table 1 (default: 9, all)"
+    )
+    parser.add_argument("--seed", type=at_least(0), default=0, help="seed of the starts (default: 0)")
     parser.add_argument(
         "--out",
         type=Path,
