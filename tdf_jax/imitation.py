@@ -102,7 +102,8 @@ def imitate(
         CategoryWarning: the object, or the target, is probably of another category than the demonstration's, or the
             network of the object describes a demonstrated target that is probably not of its category.
         ForeignPointsWarning: see `encode`.
-        ConfidenceWarning: the pick is probably wrong. Both are known for shipped weights and the default config.
+        ConfidenceWarning: the pick is probably wrong. This and the category are judged with shipped weights and the
+            default config only.
         SizeWarning: see `encode`.
     """
     checks.key("imitate()", key)
