@@ -18,6 +18,7 @@ from tdf_jax._internal.files import replace_file
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.target import Target
 from tdf_jax.geometry.trajectory import Trajectory
+from tdf_jax.io.content import known_suffix
 from tdf_jax.networks.model import Model, fingerprint
 from tdf_jax.solvers.result import Result
 
@@ -107,7 +108,7 @@ def save_imitation(path: str | os.PathLike, scene: ImitationScene) -> None:
     Raises:
         InputError: the suffix is not .npz, or the file cannot be written.
     """
-    path = _npz("save_imitation()", path)
+    path = known_suffix("save_imitation()", path, (".npz",))
     demonstration, target = scene.demonstration, scene.demonstration.target
     arrays = {
         "demonstration_points": demonstration.points,
@@ -192,7 +193,7 @@ def _scene_file(path: Path) -> Path:
     if not path.is_dir():
         if not path.exists() and path.suffix != ".npz":
             raise InputError(f"load_imitation(): there is no folder {path}; expected one that `tdf imitate` wrote")
-        checks.existing_file("load_imitation()", _npz("load_imitation()", path))
+        checks.existing_file("load_imitation()", known_suffix("load_imitation()", path, (".npz",)))
         return path
     if (path / SCENE).is_file():
         return path / SCENE
@@ -244,10 +245,3 @@ def _mesh(arrays: Mapping[str, np.ndarray], name: str) -> "trimesh.Trimesh | Non
     import trimesh
 
     return trimesh.Trimesh(arrays[f"{name}_vertices"], arrays[f"{name}_faces"], process=False)
-
-
-def _npz(function: str, path: str | os.PathLike) -> Path:
-    path = checks.path(function, path)
-    if path.suffix != ".npz":
-        raise InputError(f"{function}: {path} has suffix {path.suffix!r}; expected .npz")
-    return path

@@ -261,7 +261,8 @@ class Result:
         place = f"its place is not seen ({int(self.points_at_pick)} points of the cloud are there); " * unseen
         if not np.isfinite(np.asarray(self.look_from)).all():
             return f"{place}compare the other candidates, and check that the cloud shows nothing but the object"
-        return f"{place}look from {_numbers(self.look_from)}, world frame, from the object to the camera"
+        direction = _numbers(self.look_from)
+        return f"{place}look from the direction {direction}, a unit vector from the object to the camera, world frame"
 
     @property
     def _numpy(self):

@@ -102,12 +102,13 @@ def test_a_doubtful_result_says_where_to_look_from():
     assert canned().advice == "" and "advice" not in repr(canned())
     assert canned(confidence=np.float32(0.7), look_from=somewhere).advice == ""
     unseen = canned(**doubtful, look_from=somewhere)
-    assert unseen.advice.startswith(
-        "its place is not seen (4 points of the cloud are there); look from (0.600, -0.800,"
+    assert unseen.advice == (
+        "its place is not seen (4 points of the cloud are there); look from the direction (0.600, -0.800, 0.000), "
+        "a unit vector from the object to the camera, world frame"
     )
     assert unseen.advice in repr(unseen)
     seen = canned(**doubtful | {"points_at_pick": np.int32(300)}, look_from=somewhere)
-    assert seen.advice.startswith("look from (0.600")
+    assert seen.advice.startswith("look from the direction (0.600")
     assert "compare the other candidates" in canned(**doubtful).advice
     batch = canned(confidence=np.full(2, 0.3, np.float32))
     with pytest.raises(InputError, match="the result is a batch or traced"):
