@@ -116,6 +116,25 @@ def test_every_public_name_is_in_the_reference_of_one_package():
     assert all(f"(api/packages/{page.name})" in index for page in pages)
 
 
+def documented():
+    """Docstrings of public names, and of the public methods of public classes, by their names."""
+    for name in tdf_jax.__all__:
+        value = getattr(tdf_jax, name)
+        yield name, inspect.getdoc(value) or ""
+        if inspect.isclass(value) or inspect.ismodule(value):
+            inside = {one: part for one, part in vars(value).items() if not one.startswith("_") and callable(part)}
+            yield from ((f"{name}.{one}", inspect.getdoc(part) or "") for one, part in inside.items())
+
+
+def test_what_is_returned_reads_as_a_sentence_on_the_site():
+    """Before a colon the site expects a type, and it shows what is indented further as a quotation."""
+    found = {name: re.search(r"^Returns:\n((?: {4}.*\n?|\n)+)", text, re.MULTILINE) for name, text in documented()}
+    returned = {name: match[1].rstrip().split("\n") for name, match in found.items() if match}
+    assert len(returned) > 50
+    assert [name for name, lines in returned.items() if re.search(r":(\s|$)", re.sub("`[^`]*`", "", lines[0]))] == []
+    assert [name for name, lines in returned.items() if any(line.startswith(" " * 8) for line in lines)] == []
+
+
 def test_the_version_is_the_same_everywhere():
     """The package has it; who cites and who reads of changes finds the same."""
     found = {

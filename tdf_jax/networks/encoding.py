@@ -86,8 +86,8 @@ def encode(
 
     Returns:
         The field, in the world frame; with `return_kept`, and a mask of the points that were kept, (points,). The field
-            rotates and translates with the points, except for ties that rounding decides: in farthest-point sampling,
-            and, if the network has a symmetry-breaking offset, in which point is the farthest from the centroid.
+        rotates and translates with the points, except for ties that rounding decides: in farthest-point sampling, and,
+        if the network has a symmetry-breaking offset, in which point is the farthest from the centroid.
 
     Raises:
         InputError: the points are fewer than 21 or than the network's neighbours, not (points, 3), not finite, all
