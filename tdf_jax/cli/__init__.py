@@ -4,6 +4,7 @@ Modules:
     main: the commands, and errors as messages
     options: options that commands share
     scenes: objects and demonstrations, read from files or generated
+    imitation_record: what `tdf imitate` says of a run: result.json and the printed table
     camera: depth images, and the object that they show
     pictures: optional outputs, which may fail
     streams: standard output and error, which may fail

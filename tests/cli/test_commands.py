@@ -13,7 +13,7 @@ import pytest
 from conftest import POSES, QUERIES, STARTS
 
 import tdf_jax as tdf
-from tdf_jax.cli import imitate as report, main as command_line, scenes
+from tdf_jax.cli import imitation_record as report, main as command_line, scenes
 from tdf_jax.cli.main import main
 from tdf_jax.cli.options import Settings
 from tdf_jax.evaluation.cases import PLACE, generated_case
