@@ -4,7 +4,7 @@ A task is reachable if the arm has configurations without collision at the pick 
 own: mink from random starts, where the planner has its own damped least squares. Starts that are not reachable are
 drawn again, and every task that is drawn counts. A run that was interrupted computes what is missing.
 
-python -m tdf_jax.sim.motion_study --episodes 20 --out runs/motions
+python -m tdf_jax.sim.motion_study --episodes 20
 """
 
 import dataclasses
@@ -142,7 +142,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--poses", nargs="*", default=["upright", "tilt60"], choices=POSES, help="how objects start")
     parser.add_argument("--robot", type=Path, help="MJCF of another arm with a parallel gripper")
     parser.add_argument("--site", help="site of that file that is the gripper's frame")
-    parser.add_argument("--out", type=Path, required=True, help="folder that keeps what is measured")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("runs/motions"),
+        help="folder that keeps what is measured (default: runs/motions)",
+    )
     settings = parser.parse_args(arguments)
     rows = []
     try:

@@ -73,7 +73,6 @@ def test_the_command_says_reasons_and_continues_where_it_stopped(monkeypatch, ca
         (["--out", "kept", "--episodes", "0"], "--episodes: 0 is given; expected at least 1"),
         (["--out", "kept", "--seed", "-1"], "--seed: -1 is given"),
         (["--out", "kept", "--tasks", "nothing"], "nothing"),
-        ([], "--out"),
     ],
 )
 def test_mistakes_are_refused_before_the_work(words, message, tmp_path, monkeypatch, capsys):
