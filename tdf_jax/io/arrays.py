@@ -40,10 +40,10 @@ def read_npz(data: bytes, scale: float = 1.0) -> Float[np.ndarray, "points 3"]:
 
     Args:
         data: content of the file.
-        scale: metres per unit of the file, to be compared with a unit that the names of fields tell.
+        scale: metres per unit of the file, see `read_npy`.
 
     Returns:
-        Point cloud, (points, 3), float64, in the unit and frame of the file.
+        Point cloud, (points, 3), as of `read_npy`.
 
     Raises:
         ValueError: the file is damaged.

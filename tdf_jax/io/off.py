@@ -21,8 +21,7 @@ def read_off(data: bytes) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarr
         data: content of the file.
 
     Returns:
-        vertices, (vertices, 3), in the unit and frame of the file, all that the file has.
-        faces, (faces, 3), polygons cut into triangles; none for a cloud.
+        vertices, (vertices, 3), and faces, (faces, 3), as of `tdf_jax.io.obj.read_obj`.
 
     Raises:
         ValueError: the file is damaged.
