@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -265,7 +266,7 @@ class Result:
         return f"{place}look from the direction {direction}, a unit vector from the object to the camera, world frame"
 
     @property
-    def _numpy(self):
+    def _numpy(self) -> Any:
         return jnp if checks.traced(self.energies, self.trajectories) else np
 
     @property
