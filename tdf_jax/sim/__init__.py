@@ -27,6 +27,7 @@ Modules:
     necks: how pads hold a neck, and a neck in a cloud
     grasps: grasps of generated objects that a demonstration shows
     grasping: whether a grasp holds an object that is lifted and turned
+    approach_study: how many objects a gripper can approach as demonstrated
     centring: a grasp in the middle of what is between the fingers
     swing: turning a hand so that what it holds does not swing
     tasks: what is picked, where it goes, and where objects start

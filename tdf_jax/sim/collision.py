@@ -115,7 +115,7 @@ def first_collision(
         T = T_object
         if T_grip_object is not None and row > path.pick:
             T = path.poses[min(row, path.release)] @ T_grip_object
-        where = "to the pick" if row <= path.pick else ("along the path" if held else "on the retreat")
+        where = "on the way to the pick" if row <= path.pick else ("along the path" if held else "on the retreat")
         for (a, b), depth in collisions.depths(joints[row], opening, T).items():
             pair = {a, b}
             if pair in ({"hand"}, {"target", "table"}):

@@ -174,7 +174,10 @@ def plan_motion(
                 motion = _timed(robot, there, carried, away, transits, opening, grip)
                 return Plan(motion, turned[0], turned[-1], number, turned)
     if not reasons:
-        return Failure("the pick has no posture of the arm within its limits: it is out of reach")
+        return Failure("the pick has no configuration of the arm within its limits: it is out of reach")
+    releases = (np.asarray(poses, float)[-1] @ half for poses in candidates for half in (np.eye(4), HALF_TURN))
+    if max(reasons)[0] == 1 and all(next(configurations.at(T), None) is None for T in releases):
+        return Failure("the release has no configuration of the arm within its limits: it is out of reach")
     return Failure(max(reasons)[1])
 
 

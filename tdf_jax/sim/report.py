@@ -52,6 +52,21 @@ def criteria(runs: Sequence[Run]) -> dict[str, tuple[float | None, list[float] |
     return {name: _rate(runs, name) for name in CRITERIA if is_tested(name, condition)}
 
 
+def in_hand_motion(runs: Sequence[Run]) -> tuple[float, float] | None:
+    """Median movement in the hand after closing, metres and degrees, of the objects that were held; None if none was.
+
+    Args:
+        runs: episodes under one condition.
+    """
+    moved = np.array([(one.outcome.slip, one.outcome.turn) for one in runs if one.outcome.grasp], float)
+    moved = moved.reshape(-1, 2)
+    moved = moved[np.isfinite(moved).all(axis=1)]
+    if not len(moved):
+        return None
+    slip, turn = np.median(moved, axis=0)
+    return float(slip), float(turn)
+
+
 def is_tested(criterion: str, condition: Condition) -> bool:
     """Whether a criterion of the place is a part of what is measured.
 
@@ -123,10 +138,9 @@ def summary(runs: Sequence[Run]) -> str:
         lines.append(f"  {words}: {percent(rate)}{between}")
     parts_of_place = ", ".join(f"{WORDS[name]} {percent(rate)}" for name, (rate, _) in criteria(runs).items())
     lines.append(f"  of the place: {parts_of_place}")
-    slips = np.array([[one.outcome.slip, one.outcome.turn] for one in runs])
-    if np.isfinite(slips).any():
-        slip, turn = np.nanmedian(slips, axis=0)
-        lines.append(f"  moved in the hand, median: {1e3 * slip:.1f} mm, {turn:.1f} degrees")
+    moved = in_hand_motion(runs)
+    if moved is not None:
+        lines.append(f"  moved in the hand, median: {1e3 * moved[0]:.1f} mm, {moved[1]:.1f} degrees")
     lines += [f"  failed: {cause}: {count}" for cause, count in causes(runs).items()]
     parts = seconds(used)
     rejected, redrawn = (sum(getattr(one, name) for one in runs) for name in ("rejected", "redrawn"))

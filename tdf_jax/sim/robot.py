@@ -26,6 +26,7 @@ GRIPPER_PREFIX = "gripper/"
 HOME = (-1.5708, -1.9623, 1.5698, -1.1782, -1.5708, 0.0)
 FORWARD = -np.pi / 2  # radians about z, by which the UR5e stands so that it faces +x
 MAX_VELOCITY = 1.2  # rad/s, of every joint; the UR5e's own limit is 3.14
+FASTEST = 20.0  # rad/s; a larger limit is of no arm, but in degrees
 MAX_ACCELERATION = 3.0  # rad/s^2
 
 
@@ -131,6 +132,11 @@ def load_robot(
     mujoco = extra("load_robot()", "mujoco")
     for name, value in (("max_velocity", max_velocity), ("max_acceleration", max_acceleration)):
         checks.positive("load_robot()", name, value)
+    if max_velocity > FASTEST:
+        raise InputError(
+            f"load_robot(): max_velocity is {max_velocity}; expected rad/s, at most {FASTEST}. If it is in degrees, "
+            "multiply it by pi / 180"
+        )
     if file is None:
         if site is not None:
             raise InputError("load_robot(): there is a site and no file; omit it, or name the file of the robot")

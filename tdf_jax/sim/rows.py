@@ -65,12 +65,7 @@ class Row:
 
     def in_hand_motion(self) -> tuple[float, float] | None:
         """Median movement in the hand after closing, metres and degrees; None if nothing was held."""
-        moved = np.array([(one.outcome.slip, one.outcome.turn) for one in self.runs], float).reshape(-1, 2)
-        moved = moved[np.isfinite(moved).all(axis=1)]
-        if not len(moved):
-            return None
-        slip, turn = np.median(moved, axis=0)
-        return float(slip), float(turn)
+        return report.in_hand_motion(self.runs)
 
     def rejections(self) -> tuple[int, int]:
         """Numbers of starts out of reach, and of pairs that do not fit or of which no start is within reach."""
@@ -150,8 +145,8 @@ def planned_rows(
         and not (count > 1 and (target == "known" or method != LIBRARY))
     ]
     for flag, field, values in (
-        ("demonstrations", "demonstrations", demonstrations),
         ("targets", "target", targets or ()),
+        ("demonstrations", "demonstrations", demonstrations),
         ("methods", "method", methods),
         ("tasks", "task", tasks),
         ("masks", "mask", masks),

@@ -128,10 +128,10 @@ def _difference(pairs: Sequence[tuple[Row, Row]], same: bool = True) -> str:
                 changes.append(second[number][0] - value)
                 objects.append(one)
     mean, interval = float(np.mean(changes)), bootstrap_interval(np.array(changes), objects)
-    points = f"{abs(100 * mean):.0f}"
+    points = f"{abs(100 * mean):.1f}"
     words = (
-        f"is {'higher' if mean > 0 else 'lower'} by {points} point{'s' * (points != '1')}" if mean else "is the same"
+        f"is {'higher' if mean > 0 else 'lower'} by {points} point{'s' * (points != '1.0')}" if mean else "is the same"
     )
-    span = "" if interval is None else f", 95 % interval {100 * interval[0]:+.0f} to {100 * interval[1]:+.0f}"
+    span = "" if interval is None else f", 95 % interval {100 * interval[0]:+.1f} to {100 * interval[1]:+.1f}"
     count = len(pairs)
     return f"{words}{span} ({count} pair{'s' * (count > 1)} of rows{', the same episodes' * same})"

@@ -45,6 +45,7 @@ STUDIES = {
     "evaluation.sensitivity_study": "pairs",
     "evaluation.tracking_study": "moves",
     "evaluation.view_study": "mugs",
+    "sim.approach_study": "objects",
     "sim.motion_study": "episodes",
     "sim.removal_study": "objects",
 }

@@ -129,7 +129,9 @@ def test_a_table_in_the_way_is_said(robot, surrounded):
     low = pick.copy()
     low[2, 3] -= 0.08
     path = tdf.Trajectory.from_matrices(lifted(low, release))
-    with pytest.raises(InputError, match=r"plan_joints\(\): there is no motion: hand and \w+ collide to the pick"):
+    with pytest.raises(
+        InputError, match=r"plan_joints\(\): there is no motion: hand and \w+ collide on the way to the pick"
+    ):
         tdf.plan_joints(path, robot, opening=opening, cell=cell)
 
 
@@ -192,7 +194,7 @@ def test_the_robot_may_not_overlap_with_itself_and_a_cloud_may_by_a_millimetre()
 def test_a_release_out_of_reach_is_said(robot, corners):
     end = corners.copy()
     end[2:, 0, 3] += 2
-    with pytest.raises(InputError, match=r"plan_joints\(\): there is no motion: the arm cannot follow the path"):
+    with pytest.raises(InputError, match=r"plan_joints\(\): there is no motion: the release has no configuration"):
         tdf.plan_joints(tdf.Trajectory.from_matrices(end), robot)
 
 

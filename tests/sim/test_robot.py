@@ -112,6 +112,7 @@ def test_wrong_arguments_are_refused(arm, tmp_path):
         ("home is .*; expected 3 finite angles", (arm(), "grip"), {"home": (0, 0, np.nan)}),
         ("home is .*3.* outside of .* limits", (arm(), "grip"), {"home": (0, 3, 0)}),
         ("max_velocity is 0", (arm(), "grip"), {"max_velocity": 0}),
+        ("max_velocity is 60; expected rad.s, at most 20", (arm(), "grip"), {"max_velocity": 60}),
         ("max_acceleration is -1", (arm(), "grip"), {"max_acceleration": -1}),
     )
     for message, arguments, options in calls:
