@@ -32,6 +32,7 @@ Modules:
     swing: turning a hand so that what it holds does not swing
     tasks: what is picked, where it goes, and where objects start
     replay: baselines: the demonstrated path by other means, and the paper's energy
+    placement: whether an object is placed, once it has settled
     episode: one task from the start to the settled end
     condition: what a row of episodes is measured under, and what its episodes share
     imitator: what is imitated in the episodes of a campaign

@@ -2,33 +2,26 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from tdf_jax.evaluation.relation_success import UPRIGHT, hole_is_crossed
 from tdf_jax.geometry.symmetry import ROUND
-from tdf_jax.shapes import Mug, Rack
 from tdf_jax.sim.collision import ARM, HAND_KIND, OBJECT_KIND, TABLE_KIND, TARGET_KIND, geom_kinds
 from tdf_jax.sim.configurations import HALF_TURN
 from tdf_jax.sim.execution import Payload, execute
 from tdf_jax.sim.grasping import MOST_SLIP, MOST_TURN, evaluate_grasp
 from tdf_jax.sim.motion import Failure, plan_motion
-from tdf_jax.sim.physics import TIMESTEP, extra
+from tdf_jax.sim.physics import TIMESTEP
+from tdf_jax.sim.placement import WATCHED, contact_pairs, judge, judge_reset, settle
 from tdf_jax.sim.robot import Robot
 from tdf_jax.sim.tasks import TASKS, Episode
-from tdf_jax.sim.workcell import FIXTURE, OBJECT, TARGET, Workcell, build_workcell
+from tdf_jax.sim.workcell import FIXTURE, OBJECT, Workcell, build_workcell
 
 MODES = ("execute", "teleport")
-SETTLE = 2.0  # seconds after the release, as in NDF and R-NDF
-LAST = 0.1  # seconds at the end of them in which a contact counts: a mug that swings leaves its peg for moments
-MOVING = 0.25  # m/s, faster than a mug that swings on its peg, which nothing damps but friction
-UPSIDE_DOWN = 1.0  # seconds with gravity reversed
-FALLS = 0.03  # metres that an object moves from its target then, unless it is stuck in it
 LOST = 0.1  # seconds without contact after which the object is not in the hand any more
-WATCHED = 5  # steps of the physics between looks
 # Errors of a pick, metres and degrees, from which it is the pick that failed.
 WRONG_PICK = (0.03, 30.0)
 NOT_DRAWN = "not drawn"  # no start is within reach: there is no episode
@@ -50,22 +43,6 @@ CAUSES = (
 )
 # What a placement must be, each a field of `Outcome`.
 CRITERIA = ("touches", "off_table", "settled", "upright", "comes_off", "hung", "no_collision")
-
-
-class Verdict(NamedTuple):
-    """Whether an object is placed.
-
-    Attributes:
-        placed: whether it is, whatever a mug hangs by.
-        cause: what is wrong, of `CAUSES`; empty if it is placed, and a mug hangs by its handle.
-        detail: more about it, in words.
-        criteria: whether each of `CRITERIA` holds.
-    """
-
-    placed: bool
-    cause: str
-    detail: str
-    criteria: dict[str, bool]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,7 +134,7 @@ def teleport(
         fixture=episode.fixture,
         watch=watch,
     )
-    placed, cause, detail, criteria = _reset(episode, motion @ episode.T_world_object, watch)
+    placed, cause, detail, criteria = judge_reset(episode, motion @ episode.T_world_object, watch)
     if not grasp.held:
         wrong = _pick_error(episode, pick)
         cause = "pick wrong" if wrong else "slipped"
@@ -204,7 +181,7 @@ def run_episode(
     execute(cell, data, plan.motion, observer, Payload(episode.object_body.mass, centre[:3]))
     contacts = settle(cell, data, watch)
     observer.note(data, "end")
-    placed, cause, detail, criteria = _judged(episode, cell, data, contacts)
+    placed, cause, detail, criteria = judge(episode, cell, data, contacts)
     criteria["no_collision"] = not observer.collided
     slip, turn = observer.in_hand_motion()
     if observer.collided:
@@ -249,7 +226,7 @@ class _Observer:
             self.note(data, "closed")
         if step % WATCHED:
             return
-        pairs = _contacts(self.kinds, data)
+        pairs = contact_pairs(self.kinds, data)
         if not self.collided:
             for a, b, words in (
                 (ARM, TABLE_KIND, "the arm touches the table"),
@@ -292,20 +269,6 @@ class _Observer:
         return np.linalg.inv(self.cell.gripper_pose(data)) @ self.cell.body_pose(data, OBJECT)
 
 
-def _reset(episode: Episode, T_world_object, watch=None) -> Verdict:
-    """Reset the object, let 2 s pass, and judge."""
-    cell = reset_cell(episode, T_world_object)
-    data = cell.data()
-    verdict = _judged(episode, cell, data, settle(cell, data, watch))
-    comes_off = _comes_off(episode, cell.body_pose(data, OBJECT), cell.body_pose(data, TARGET))
-    verdict.criteria["comes_off"] = comes_off
-    if verdict.placed and not comes_off:
-        return verdict._replace(
-            placed=False, cause="stuck", detail="with gravity reversed the object stays on the target"
-        )
-    return verdict
-
-
 def start_cell(episode: Episode, robot: Robot) -> Workcell:
     """The cell of an episode at its start, with the robot.
 
@@ -322,94 +285,6 @@ def start_cell(episode: Episode, robot: Robot) -> Workcell:
         fixture=episode.fixture,
         fixed_target=TASKS[episode.task].fixed,
     )
-
-
-def reset_cell(episode: Episode, T_world_object: Float[np.ndarray, "4 4"]) -> Workcell:
-    """The cell of an episode without a robot, the object reset to a pose.
-
-    Args:
-        episode: the episode.
-        T_world_object: pose of the object, 4x4, metres, world frame.
-    """
-    return build_workcell(
-        None,
-        episode.object_body,
-        T_world_object,
-        episode.target_body,
-        episode.T_world_target,
-        fixed_target=TASKS[episode.task].fixed,
-    )
-
-
-def _comes_off(episode: Episode, T_object, T_target) -> bool:
-    """Whether an object comes off with gravity reversed, where the target stays and there is no table."""
-    mujoco = extra("teleport()", "mujoco")
-    turned = build_workcell(None, episode.object_body, T_object, episode.target_body, T_target, table=False)
-    turned.model.opt.gravity[2] *= -1
-    data = turned.data()
-    for _ in range(int(UPSIDE_DOWN / TIMESTEP)):
-        mujoco.mj_step(turned.model, data)
-    return bool(np.linalg.norm(turned.body_pose(data, OBJECT)[:3, 3] - T_object[:3, 3]) >= FALLS)
-
-
-def settle(
-    cell: Workcell, data: Any, watch: Callable[[Workcell, Any, str], None] | None = None
-) -> set[tuple[int, int]]:
-    """Let 2 s pass.
-
-    Args:
-        cell: the cell.
-        data: its state, which changes.
-        watch: called every few steps with the cell, the state and the phase.
-
-    Returns:
-        Pairs of kinds of geoms (see `tdf_jax.sim.collision`), the smaller number first, that met in the last 0.1 s.
-    """
-    mujoco = extra("run_episode()", "mujoco")
-    kinds, steps, contacts = geom_kinds(cell), round(SETTLE / TIMESTEP), set()
-    for step in range(steps):
-        mujoco.mj_step(cell.model, data)
-        if step >= steps - round(LAST / TIMESTEP):
-            contacts |= _contacts(kinds, data)
-        if watch is not None and (step % WATCHED == 0 or step == steps - 1):
-            watch(cell, data, "settling")
-    return contacts
-
-
-def _contacts(kinds: np.ndarray, data: Any) -> set[tuple[int, int]]:
-    """Pairs of kinds of geoms that are in contact, the smaller number first."""
-    return {(a, b) for a, b in np.sort(kinds[data.contact.geom[: data.ncon]], axis=1).tolist()}
-
-
-def _judged(episode: Episode, cell: Workcell, data: Any, contacts: set[tuple[int, int]]) -> Verdict:
-    """Whether the object is placed, by each criterion that the end shows."""
-    T_target_object = np.linalg.inv(cell.body_pose(data, TARGET)) @ cell.body_pose(data, OBJECT)
-    is_mug = episode.object.category == "mug"
-    hung = True
-    if is_mug:
-        mug, rack = cast(Mug, episode.object), cast(Rack, episode.target)
-        hung = any(hole_is_crossed(mug, line, T_target_object) for line in rack.peg_lines)
-    tilt = float(np.degrees(np.arccos(np.clip(cell.body_pose(data, OBJECT)[2, 2], -1, 1))))
-    criteria = {
-        "touches": (OBJECT_KIND, TARGET_KIND) in contacts,
-        "off_table": (OBJECT_KIND, TABLE_KIND) not in contacts,
-        "settled": bool(np.linalg.norm(data.joint(OBJECT).qvel[:3]) <= MOVING),
-        "upright": tilt <= UPRIGHT,
-        "comes_off": False,
-        "hung": hung,
-        "no_collision": True,
-    }
-    for name, cause, detail in (
-        ("touches", "fell", "the object does not touch the target"),
-        ("off_table", "fell", "the object touches the table"),
-        ("settled", "not settled", f"the object still moves after {SETTLE:g} s"),
-        ("upright", "not upright", f"{tilt:.0f} degrees from upright"),
-    ):
-        if not criteria[name] and not (name == "upright" and is_mug):
-            return Verdict(False, cause, detail, criteria)
-    if not hung:
-        return Verdict(True, "not on the peg", "no peg goes through the finger hole", criteria)
-    return Verdict(True, "", "", criteria)
 
 
 def _pick_error(episode: Episode, pick) -> str:

@@ -9,9 +9,10 @@ from jaxtyping import Float, UInt8
 
 from tdf_jax.sim.campaign import Run, found_in, process_pool
 from tdf_jax.sim.condition import Settings
-from tdf_jax.sim.episode import NOT_FOUND, reset_cell, run_episode, settle
+from tdf_jax.sim.episode import NOT_FOUND, run_episode
 from tdf_jax.sim.grasping import CLOSE, LIFT, LIFTED, FloatingHand
 from tdf_jax.sim.imitator import Found
+from tdf_jax.sim.placement import reset_cell, settle
 from tdf_jax.sim.recording import Recorder, gl_context
 from tdf_jax.sim.robot import Robot
 from tdf_jax.sim.tasks import TASKS, Episode

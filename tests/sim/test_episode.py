@@ -7,7 +7,7 @@ import pytest
 from conftest import lifted
 from scipy.spatial.transform import Rotation
 
-from tdf_jax.sim import episode as module
+from tdf_jax.sim import episode as module, placement
 from tdf_jax.sim.episode import CAUSES, run_episode, teleport
 from tdf_jax.sim.tasks import TASKS, demonstrate_episode
 
@@ -139,15 +139,15 @@ def test_errors_of_a_pick_leave_out_the_symmetries(drawn):
 def test_a_contact_shortly_before_the_end_counts(drawn, monkeypatch):
     """A bowl that rests, and then is thrown up: in the air it has left the board less than 0.1 s ago, or more."""
     episode = drawn("bowl_on_shelf")
-    cell = module.reset_cell(episode, episode.T_world_target @ episode.T_target_object)
+    cell = placement.reset_cell(episode, episode.T_world_target @ episode.T_target_object)
     data = cell.data()
-    on_board = (module.OBJECT_KIND, module.TARGET_KIND)
-    assert module.settle(cell, data) == {on_board}
+    on_board = (placement.OBJECT_KIND, placement.TARGET_KIND)
+    assert placement.settle(cell, data) == {on_board}
     data.joint("object").qvel[2] = 1.0
-    monkeypatch.setattr(module, "SETTLE", 0.08)
-    assert module.settle(cell, data) == {on_board} and data.ncon == 0
-    monkeypatch.setattr(module, "LAST", 0.02)
-    assert module.settle(cell, data) == set()
+    monkeypatch.setattr(placement, "SETTLE", 0.08)
+    assert placement.settle(cell, data) == {on_board} and data.ncon == 0
+    monkeypatch.setattr(placement, "LAST", 0.02)
+    assert placement.settle(cell, data) == set()
 
 
 def test_causes_are_named_once():
