@@ -99,8 +99,8 @@ def benchmark(
         episodes: number of episodes in every row of --simulation; 0 for none, with --meshes.
         light: teleported objects of --simulation weigh 0.01 kg, as in NDF and R-NDF.
         processes: number of processes of --simulation, on which the outcomes do not depend.
-        page: write a page of the first failure of each cause of --simulation, to turn and play in a browser without a
-            network, in the folder runs/failures; needs the extra "pages".
+        page: write pages of failures, to turn and play in a browser without a network, in the folder runs/failures:
+            those that benchmark.md lists, or the first of each cause of --simulation; needs the extra "pages".
         playbacks: keep the motion of every episode of --simulation in the folder runs/episodes, 80 kB each, which
             `tdf view` and --page play.
         object_weights: weights of the object of --relations.
@@ -110,10 +110,12 @@ def benchmark(
     from tdf_jax._internal.errors import InputError
     from tdf_jax._internal.files import replace_file
     from tdf_jax.cli.attempts import attempts_folder
+    from tdf_jax.cli.pictures import check_page
     from tdf_jax.evaluation.annotated_meshes import load_annotated
     from tdf_jax.evaluation.demonstration_count import count_errors
+    from tdf_jax.evaluation.path_failures import failure_scene, failures, page_name
     from tdf_jax.evaluation.path_methods import METHODS
-    from tdf_jax.evaluation.path_report import page as report, record, sections
+    from tdf_jax.evaluation.path_report import LISTED, page as report, record, sections
     from tdf_jax.evaluation.path_scores import run, score
     from tdf_jax.evaluation.records import folder_name, write_record
     from tdf_jax.geometry.winding import libigl
@@ -136,7 +138,7 @@ def benchmark(
             "--targets": (targets is not None, (simulated,)), "--masks": (masks != ("segmented",), (simulated,)),
             "--episodes": (episodes != 100, (simulated,)),
             "--light": (light, (simulated,)), "--processes": (processes is not None, (simulated,)),
-            "--page": (page, (simulated,)), "--no-playbacks": (not playbacks, (simulated,)),
+            "--page": (page, (plain, simulated)), "--no-playbacks": (not playbacks, (simulated,)),
         },
     )  # fmt: skip
     if simulation:
@@ -166,6 +168,8 @@ def benchmark(
         }  # fmt: skip
         return measure(out, settings)
     _check(pairs, seed, height, clouds, methods, num_starts, meshes, num_poses, demonstrations)
+    if page:
+        check_page("tdf benchmark")
     names = list(METHODS) if "all" in methods else [name for name in METHODS if name in methods]
     if meshes is not None:
         libigl("tdf benchmark")
@@ -183,10 +187,13 @@ def benchmark(
         for condition in dict.fromkeys(clouds)
         for make in _makers(pairs, seed, height, condition, scans, num_poses)
     ]
-    scores = [
-        score(method, attempt, task)
-        for task, method, attempt in run(makers, model, names, folder, seed=seed, num_starts=num_starts)
-    ]
+    scores, scenes = [], {}
+    for task, method, attempt in run(makers, model, names, folder, seed=seed, num_starts=num_starts):
+        scores.append(score(method, attempt, task))
+        if page and failures(scores[-1:]):
+            scenes[page_name(scores[-1])] = failure_scene(task, attempt)
+            listed = [page_name(one) for one in failures(scores)[:LISTED]]
+            scenes = {name: scene for name, scene in scenes.items() if name in listed}  # a scan may be large
     if not scores:
         raise InputError(
             "tdf benchmark: none of --methods can run on these objects; the oracle needs generated mugs, and variants "
@@ -195,14 +202,14 @@ def benchmark(
     settings = {
         "weights": weights, "pairs": pairs, "seed": seed, "height": height, "clouds": clouds, "methods": methods,
         "num_starts": num_starts, "meshes": folder_name(meshes), "recursive": recursive,
-        "num_poses": num_poses, "demonstrations": demonstrations,
+        "num_poses": num_poses, "demonstrations": demonstrations, "page": page,
     }  # fmt: skip
     picks = count_errors(makers, model, demonstrations, folder, seed=seed)
     extras = sections(scores, picks)
     write_record("tdf benchmark", out / RECORD, record(scores, model, settings, extras), indent=None)
     replace_file("tdf benchmark", out / PAGE, report(scores, model, settings, extras).encode())
     print(out / PAGE)
-    _draw(out, makers, scores, extras)
+    _draw(out, makers, scores, extras, scenes)
 
 
 def _given(values: tuple | None, default: tuple) -> tuple:
@@ -249,10 +256,11 @@ def _makers(pairs, seed, height, clouds, targets, num_poses) -> list[Callable]:
     return [functools.partial(generated, index) for index in range(pairs)] + meshes
 
 
-def _draw(out, makers, scores, extras) -> None:
+def _draw(out, makers, scores, extras, scenes) -> None:
     from tdf_jax.cli.pictures import Pictures
+    from tdf_jax.evaluation.path_failures import failures, page_name, page_title
     from tdf_jax.evaluation.path_methods import LIBRARY
-    from tdf_jax.evaluation.path_report import PICTURES
+    from tdf_jax.evaluation.path_report import FAILURES, PICTURES
     from tdf_jax.geometry.paths import PATHS
 
     # The first six tasks are one of each path with the goal not displaced. Later tasks with the same path are drawn
@@ -281,6 +289,12 @@ def _draw(out, makers, scores, extras) -> None:
             from tdf_jax.viz.style import save_figure
 
             save_figure(path, figure(name))
+    for one in (one for one in failures(scores) if page_name(one) in scenes):
+        with pictures.drawing(out / FAILURES / page_name(one)) as path:
+            from tdf_jax.viz.imitation_page import save_imitation_page
+
+            path.parent.mkdir(exist_ok=True)
+            save_imitation_page(path, scenes[page_name(one)], page_title(one))
     pictures.check()
 
 

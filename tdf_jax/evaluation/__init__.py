@@ -15,6 +15,7 @@ Modules:
     demonstration_count: picks from several demonstrations
     foreign_study: picks on clouds with foreign points, with and without their removal
     metrics: errors of poses and paths
+    path_failures: failures at whole trajectories, and scenes of them
     path_methods: methods that imitate a whole trajectory
     path_report: page and record of `tdf benchmark`
     path_scores: attempts of every method on every task, and their errors

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from tdf_jax.evaluation.demonstration_count import CountErrors
+from tdf_jax.evaluation.path_failures import failures, page_name
 from tdf_jax.evaluation.path_methods import EVERY, LIBRARY, MANY, NEAR
 from tdf_jax.evaluation.path_scores import Score, by_method, summary
 from tdf_jax.evaluation.path_tasks import DISPLACEMENTS, NUM_POSES
@@ -29,6 +30,7 @@ PICTURES = {
 SHOWN = {name: THRESHOLDS[name] for name in ("1cm_10deg", "2cm_20deg", "5cm_30deg")}
 HEADS = [threshold.label("°") for threshold in SHOWN.values()]
 LISTED = 12  # number of failures that the page lists
+FAILURES = "runs/failures"  # folder of their pages, beside the page
 
 
 def page(scores: Sequence[Score], model: Model, settings: Mapping[str, Any], extras: Mapping[str, Any]) -> str:
@@ -54,7 +56,7 @@ def page(scores: Sequence[Score], model: Model, settings: Mapping[str, Any], ext
         ]
         if number == 0:
             parts += [_split(groups, "path", PATHS), f"![Errors of picks and paths]({PICTURES['errors']})"]
-    parts += [_failures(scores)]
+    parts += [_failures(scores, settings["page"])]
     if "reliability" in extras:
         parts += [_reliability(extras["reliability"])]
     if "demonstrations" in extras:
@@ -216,14 +218,13 @@ def _split(groups: Mapping[str, list[Score]], by: str, values: Iterable[str]) ->
     return f"Path error, cm, median, by {by}:\n\n" + markdown(heads, rows)
 
 
-def _failures(scores: Sequence[Score]) -> str:
-    ours = [one for one in scores if one.method == LIBRARY]
-    failed = sorted((one for one in ours if not one.succeeds(SUCCESS)), key=lambda one: -one.angles[0])
+def _failures(scores: Sequence[Score], pages: bool) -> str:
+    ours, failed = [one for one in scores if one.method == LIBRARY], failures(scores)
     words = f"## Failures\n\nOf {len(ours)} picks of `{LIBRARY}`, {len(failed)} are off by more than 2 cm or 20°"
     if not failed:
         return words + "."
     within = sum(one.best_succeeds(SUCCESS) for one in failed)
-    heads = ["object", "cloud", "path", "pick, cm", "degrees", "best, cm", "degrees"]
+    heads = ["object", "cloud", "path", "pick, cm", "degrees", "best, cm", "degrees", *["page"] * pages]
     rows = [
         [
             one.instance,
@@ -233,6 +234,7 @@ def _failures(scores: Sequence[Score]) -> str:
             f"{one.angles[0]:.0f}",
             f"{100 * one.best_pick[0]:.1f}",
             f"{one.best_pick[1]:.0f}",
+            *[f"[task {one.task}]({FAILURES}/{page_name(one)})"] * pages,
         ]
         for one in failed[:LISTED]
     ]

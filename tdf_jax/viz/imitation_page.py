@@ -21,6 +21,7 @@ from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, TRUTH
 RATE = 12  # frames a second
 DISTANCE = 2.6  # of the camera, in the size of the scene
 PICK, OTHERS = 0.35, (0.6, 0.95)  # places in the colour map: the pick, and the other distinct picks by rising energy
+CLOUD_NAME = "cloud of the object"
 SHOWN_MODES = 4  # distinct picks besides the best
 
 
@@ -121,27 +122,33 @@ def _draw(plotly, drawn: list, moving: list[dict], name: str, panel: Side, box: 
         shares = {"scene": name, "name": "target", "legendgroup": "target", "showlegend": first}
         drawn.append(plotly.Scatter3d(**_axes(thinned(panel.target)), mode="markers", marker=look, **shares))
     shares = {"scene": name, "name": "object", "legendgroup": "object", "showlegend": first, "hoverinfo": "skip"}
-    if panel.mesh is not None and len(panel.mesh.faces) <= MOST_TRIANGLES:
+    points = thinned(panel.points)
+    marks = {"mode": "markers", "marker": {"size": 1.8, "color": matplotlib.colors.to_hex(COLOURS(0.0))}}
+    meshed = panel.mesh is not None and len(panel.mesh.faces) <= MOST_TRIANGLES
+    if meshed:
         vertices = np.asarray(panel.mesh.vertices, float)
         i, j, k = np.asarray(panel.mesh.faces).T
         colour = matplotlib.colors.to_hex(tuple(polygons3d.SURFACE_COLOUR))
         lighting = {"ambient": 0.55, "diffuse": 0.7, "specular": 0.1}
         drawn.append(plotly.Mesh3d(**_axes(vertices), i=i, j=j, k=k, color=colour, lighting=lighting, **shares))
-        moves = vertices
+        moving.append(_moving(drawn, vertices, motion.object_rotations, motion.object_translations))
     else:
-        moves = thinned(panel.points)
-        look = {"size": 1.8, "color": matplotlib.colors.to_hex(COLOURS(0.0))}
-        drawn.append(plotly.Scatter3d(**_axes(moves), mode="markers", marker=look, **shares))
-    moving.append(_moving(drawn, moves, motion.object_rotations, motion.object_translations))
+        drawn.append(plotly.Scatter3d(**_axes(points), **marks, **shares))
+        moving.append(_moving(drawn, points, motion.object_rotations, motion.object_translations))
     words = {"legendgroup": "path", "showlegend": first, "line": {"color": INK, "width": 4}}
-    marks = {"mode": "lines+markers", "marker": {"size": 2.5, "color": INK}}
-    drawn.append(_line(plotly, panel.path[:, 4:], name, "path of the query frame", **words, **marks))
+    line = {"mode": "lines+markers", "marker": {"size": 2.5, "color": INK}}
+    drawn.append(_line(plotly, panel.path[:, 4:], name, "path of the query frame", **words, **line))
     edges = _lines(box)
     start = edges @ motion.rotations[0].T + motion.translations[0]
     colour = matplotlib.colors.to_hex(COLOURS(PICK))
     words = {"legendgroup": "box", "showlegend": first, "line": {"color": colour, "width": 6}}
     drawn.append(_line(plotly, start, name, "box of query points", **words))
     moving.append(_moving(drawn, edges, motion.rotations, motion.translations))
+    if meshed:  # what the network was given: a camera sees one side
+        others = [one.name for one in drawn]
+        shares |= {"name": CLOUD_NAME, "legendgroup": "cloud", "showlegend": CLOUD_NAME not in others}
+        drawn.append(plotly.Scatter3d(**_axes(points), **marks, **shares, visible="legendonly"))
+        moving.append(_moving(drawn, points, motion.object_rotations, motion.object_translations))
 
 
 def _add_expected(plotly, drawn: list, wxyz_xyz: np.ndarray, box: np.ndarray, grasp: int) -> None:

@@ -10,6 +10,7 @@ import matplotlib
 import matplotlib.figure
 import numpy as np
 import pytest
+from conftest import page_content
 
 from tdf_jax.cli.benchmark import Cloud
 from tdf_jax.cli.main import main
@@ -82,6 +83,22 @@ def test_a_run_writes_a_page_a_record_and_pictures_and_nothing_beside_them(folde
 
 def test_the_page_shows_the_pictures_that_there_are(folder):
     assert set(re.findall(r"\]\((.*?\.png)\)", told(folder))) == {path.name for path in folder.glob("*.png")}
+
+
+def test_pages_show_the_failures_that_are_listed(folder, weights, tmp_path):
+    pytest.importorskip("plotly", reason="the extra 'pages' is not installed")
+    out = shutil.copytree(folder, tmp_path / "out")
+    run("--weights", weights, *PLAIN, "--page", "--out", out)
+    links = re.findall(r"\[task \d\]\((.*?)\)", told(out))
+    assert links  # weights of random numbers
+    pages = sorted((out / "runs" / "failures").iterdir())
+    assert sorted(links) == [str(path.relative_to(out)) for path in pages]
+    for path in pages:
+        text = path.read_text()
+        assert len(text) < 5_000_000 and "the pick is off by" in text
+        names = [one["name"] for one in page_content(text)["data"]]
+        assert {"true trajectory and pick", "cloud of the object", "path of the query frame"} <= set(names)
+    assert json.loads((out / "benchmark.json").read_text())["tasks"] == read(folder)["tasks"]
 
 
 def test_the_record_has_every_task_by_every_method_and_the_settings(folder, weights):

@@ -24,6 +24,7 @@ from tdf_jax.evaluation.annotated_meshes import AnnotatedMesh
 from tdf_jax.evaluation.cases import mug_case
 from tdf_jax.evaluation.demonstration_count import CountErrors, count_errors
 from tdf_jax.evaluation.metrics import pose_error
+from tdf_jax.evaluation.path_failures import failure_scene, failures, page_name, page_title
 from tdf_jax.evaluation.path_methods import METHODS, Attempt, Attempts
 from tdf_jax.evaluation.path_report import LISTED, page, record, sections
 from tdf_jax.evaluation.path_scores import Score, by_method, run, score, summary
@@ -1238,6 +1239,7 @@ SETTINGS = {
     "meshes": None,
     "num_poses": 6,
     "demonstrations": (),
+    "page": False,
 }
 COUNTS = [
     CountErrors("full", 1, "mean", [0.004, 0.012, 0.04], [5.0, 9.0, 50.0]),
@@ -1323,6 +1325,31 @@ def test_the_worst_failures_are_listed_in_order(many, text):
         assert [float(cell) for cell in cells[3:]] == pytest.approx(
             [100 * one.distances[0], one.angles[0], 100 * one.best_pick[0], one.best_pick[1]], abs=0.51
         )
+
+
+def test_listed_failures_link_to_their_pages(many, model, text):
+    linked = page(many, model, SETTINGS | {"page": True}, {})
+    shown = failures(many)[:LISTED]
+    links = re.findall(r"\[task (\d+)\]\(runs/failures/(.+?)\)", linked)
+    assert links == [(str(one.task), page_name(one)) for one in shown] and "runs/failures" not in text
+    assert page_title(shown[0]).endswith(f" cm and {shown[0].angles[0]:.0f} degrees")
+    assert "tdf benchmark" in linked and "--page" in linked.split("`")[1]
+
+
+def test_a_failure_is_shown_with_its_candidates_and_the_ground_truth(task):
+    trajectories = np.stack([np.asarray(task.expected.shifted(np.full(3, shift)).wxyz_xyz) for shift in (0.1, 0.3)])
+    scene = failure_scene(task, Attempt(trajectories, np.array([2.0, 1.0]), 0.5, residual=0.6))
+    np.testing.assert_allclose(scene.result.trajectory.wxyz_xyz, trajectories[1])
+    np.testing.assert_allclose(scene.expected.wxyz_xyz, task.expected.wxyz_xyz)
+    assert (
+        scene.result.confidence == pytest.approx(calibration.confidence(0.6))
+        and scene.demonstration is task.demonstration
+    )
+    np.testing.assert_array_equal(scene.points, task.case.points_b)
+    first, second = (np.asarray(mesh.vertices) for mesh in scene.meshes)
+    np.testing.assert_allclose(first, task.case.object_a.mesh.vertices)
+    T = task.case.T_world_b
+    np.testing.assert_allclose(second, np.asarray(task.case.object_b.mesh.vertices) @ T[:3, :3].T + T[:3, 3])
 
 
 def test_the_one_pick_that_failed_is_listed(model):
