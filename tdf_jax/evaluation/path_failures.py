@@ -1,5 +1,6 @@
 """Failures of the library at whole trajectories: which they are, and what a picture of one needs."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ from tdf_jax.evaluation.statistics import SUCCESS
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.solvers.imitation_scene import ImitationScene
 from tdf_jax.solvers.result import Result
+from tdf_jax.uncertainty.advice import points_at
 from tdf_jax.uncertainty.calibration import confidence
 
 
@@ -63,6 +65,9 @@ def failure_scene(task: Task, attempt: Attempt) -> ImitationScene:
         history=np.zeros((len(attempt.scores), 0)),
         confidence=np.float32(np.nan if (known := confidence(attempt.residual)) is None else known),
     )
+    if np.asarray(result.finite).any():
+        seen = points_at(case.points_b, result.pick, task.demonstration.query)
+        result = dataclasses.replace(result, points_at_pick=np.asarray(seen, np.int32))
     # Copies: a mesh is transformed in place.
     meshes = case.object_a.mesh.copy(), case.object_b.mesh.copy().apply_transform(case.T_world_b)
     expected = Trajectory(jnp.asarray(task.expected.wxyz_xyz))

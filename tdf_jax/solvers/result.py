@@ -258,8 +258,9 @@ class Result:
             )
         if not float(self.confidence) < DOUBT:
             return ""
-        unseen = int(self.points_at_pick) < SEEN
-        place = f"its place is not seen ({int(self.points_at_pick)} points of the cloud are there); " * unseen
+        count = int(self.points_at_pick)
+        unseen = 0 <= count < SEEN  # -1 where they are not counted
+        place = f"its place is not seen ({count} points of the cloud are there); " * unseen
         if not np.isfinite(np.asarray(self.look_from)).all():
             return f"{place}compare the other candidates, and check that the cloud shows nothing but the object"
         direction = _numbers(self.look_from)

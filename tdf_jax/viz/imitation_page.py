@@ -14,9 +14,9 @@ from tdf_jax.uncertainty.modes import Mode, cluster_poses
 from tdf_jax.viz import polygons3d
 from tdf_jax.viz.motion import motion_of
 from tdf_jax.viz.page import Page, camera, listed, page_of, pages, scene_axes
-from tdf_jax.viz.scene3d import MOST_TRIANGLES, VIEW, bounds, thinned
+from tdf_jax.viz.scene3d import MOST_TRIANGLES, bounds, thinned
 from tdf_jax.viz.sides import Side, sides_of, sizes_of
-from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, TRUTH
+from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, TRUTH, VIEW
 
 RATE = 12  # frames a second
 DISTANCE = 2.6  # of the camera, in the size of the scene
@@ -201,6 +201,10 @@ def _lead(scene: ImitationScene, modes: list[Mode]) -> str:
     known = [f"confidence {confidence:.2f} that the pick is right to 2 cm and 20 degrees"] * math.isfinite(confidence)
     known += [f"recognised {recognised:.2f} as the demonstration's category"] * math.isfinite(recognised)
     if known:
-        lines.append("; ".join(known).capitalize() + (f". {result.advice}" if result.advice else ""))
+        lines.append(". ".join(_sentence(part) for part in ("; ".join(known), result.advice) if part) + ".")
     lines.append("Drag to turn, scroll to zoom; a click in the legend shows or hides.")
     return "\n".join(lines)
+
+
+def _sentence(words: str) -> str:
+    return words[0].upper() + words[1:]

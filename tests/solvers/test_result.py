@@ -110,6 +110,8 @@ def test_a_doubtful_result_says_where_to_look_from():
     seen = canned(**doubtful | {"points_at_pick": np.int32(300)}, look_from=somewhere)
     assert seen.advice.startswith("look from the direction (0.600")
     assert "compare the other candidates" in canned(**doubtful).advice
+    uncounted = canned(confidence=np.float32(0.3), look_from=somewhere)
+    assert uncounted.advice == seen.advice
     batch = canned(confidence=np.full(2, 0.3, np.float32))
     with pytest.raises(InputError, match="the result is a batch or traced"):
         _ = batch.advice

@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -6,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
-from tdf_jax.viz.imitation_page import save_imitation_page
+from tdf_jax.viz.imitation_page import imitation_page, save_imitation_page
 from tdf_jax.viz.motion import motion_of
 
 plotly = pytest.importorskip("plotly")
@@ -54,6 +56,27 @@ def test_a_page_is_small_and_needs_no_network(page, scene):
         f"pick {number}" for number in range(2, len(modes) + 1)
     ]
     assert {one["type"] for one in content["data"]} == {"scatter3d", "mesh3d"}
+
+
+def test_a_doubtful_pick_is_explained_above_the_picture(scene):
+    result = dataclasses.replace(scene.result, confidence=np.float32(0.2), points_at_pick=np.int32(3))
+    text = imitation_page("page()", dataclasses.replace(scene, result=result)).text
+    assert (
+        "<p>Confidence 0.20 that the pick is right to 2 cm and 20 degrees. Its place is not seen (3 points of the "
+        "cloud are there); compare the other candidates, and check that the cloud shows nothing but the object.</p>"
+    ) in text
+
+
+def test_the_cloud_beside_a_mesh_can_be_shown_and_moves_with_it(page, scene):
+    content = page_content(page.read_text())
+    names = [one["name"] for one in content["data"]]
+    assert names.count("cloud of the object") == 1  # the demonstration has no mesh, so its cloud is its object
+    number = names.index("cloud of the object")
+    cloud = content["data"][number]
+    assert cloud["visible"] == "legendonly" and cloud["scene"] == "scene2"
+    np.testing.assert_allclose(np.array([cloud[axis] for axis in "xyz"]).T, 100 * scene.points, atol=6e-3)
+    (moving,) = (one for one in content["moving"] if one["trace"] == number)
+    assert moving["motions"] == content["moving"][2]["motions"]  # of the mesh
 
 
 def test_what_moves_begins_where_it_is_drawn_and_ends_at_the_release(page, scene):
