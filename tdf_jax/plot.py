@@ -261,7 +261,7 @@ def page(
     if not isinstance(what, Landscape):
         raise InputError(f"plot.page(): got a {type(what).__name__}; expected an ImitationScene or a Landscape")
     cloud = np.zeros((0, 3)) if points is None else np.asarray(checks.points("plot.page()", points))
-    from tdf_jax.viz.html import landscape_page
+    from tdf_jax.viz.landscape_page import landscape_page
     from tdf_jax.viz.landscapes import Marks
 
     return landscape_page("plot.page()", what, Marks(cloud, mesh), title or "Energy landscape")

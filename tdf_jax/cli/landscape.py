@@ -225,9 +225,9 @@ def _draw(settings, folder: Path, scene: Scene, found: Landscape, expected, path
             save_slices(file, found, marks())
     if settings.page:
         with pictures.drawing(folder / "landscape.html") as file:
-            from tdf_jax.viz.html import save_page
+            from tdf_jax.viz.landscape_page import save_landscape_page
 
-            save_page(file, found, marks(), "Energy landscape")
+            save_landscape_page(file, found, marks(), "Energy landscape")
 
 
 def _record(settings, found: Landscape, reference, change, waypoints, expected, path, seconds) -> dict:

@@ -11,8 +11,7 @@ from tdf_jax.sim.playback import RATE, Playback
 from tdf_jax.sim.solids import Solid
 from tdf_jax.sim.workcell import OBJECT, TABLE_NAME, TARGET
 from tdf_jax.viz.page import Page, camera, listed, page_of, pages, scene_axes
-from tdf_jax.viz.scene3d import VIEW
-from tdf_jax.viz.style import CENTIMETRES, COLOURS, INK
+from tdf_jax.viz.style import CENTIMETRES, COLOURS, INK, VIEW
 
 EVERY = 2  # of the frames that are kept, one is on the page
 MOST_FRAMES = 400

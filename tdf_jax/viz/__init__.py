@@ -8,9 +8,9 @@ Modules:
     evaluation: pictures of the benchmark
     film: frames of a film of an imitation
     film_file: pictures and films as files
-    html: page of an energy landscape
     imitation: an imitation and its losses
     imitation_page: page of an imitation, which plays
+    landscape_page: page of an energy landscape
     landscapes: energy landscapes
     motion: frames between the poses of a trajectory
     page: the file of a page, which opens without a network

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory
-from tdf_jax.viz.scene3d import MARGIN, View, bounds, content, draw, frame, triangles_of, waypoint_bar
+from tdf_jax.viz.scene3d import MARGIN, WIDTH, View, bounds, content, draw, frame, triangles_of, waypoint_bar
 from tdf_jax.viz.single import losses_panel
 from tdf_jax.viz.style import STYLE, add_axes3d, blank_figure, legend_of
 
@@ -25,29 +25,29 @@ def imitation_figure(
     meshes: "tuple[trimesh.Trimesh | None, trimesh.Trimesh | None]" = (None, None),
     title: str = "",
 ) -> Figure:
-    """Reference and test side by side, as in figure 4 of the paper.
+    """Demonstration and imitation side by side, as in figure 4 of the paper.
 
     Args:
-        demonstration: the reference.
-        points: cloud of the test object, (points, 3), metres, world frame.
-        trajectory: trajectory on the test object.
+        demonstration: the demonstration.
+        points: cloud of the new object, (points, 3), metres, world frame.
+        trajectory: trajectory on the new object.
         expected: ground truth, drawn dashed.
-        meshes: meshes of the reference and the test object, metres, world frame; drawn instead of the points.
+        meshes: meshes of the demonstrated and the new object, metres, world frame; drawn instead of the points.
         title: title above both panels.
 
     Returns:
-        The figure; its axes are those of the reference, of the test and of the colour bar.
+        The figure; its axes are those of the demonstration, of the imitation and of the colour bar.
     """
     box = bounds(np.asarray(demonstration.query))
     triangles = [triangles_of(mesh) for mesh in meshes]
     views = {
-        "reference": View(np.asarray(demonstration.points), triangles[0], demonstration.trajectory),
-        "test": View(np.asarray(points), triangles[1], trajectory, expected),
+        "demonstration": View(np.asarray(demonstration.points), triangles[0], demonstration.trajectory),
+        "imitation": View(np.asarray(points), triangles[1], trajectory, expected),
     }
     contents = [content(view, box) for view in views.values()]
     size = np.max([np.ptp(one, axis=0) for one in contents], axis=0) * MARGIN
     with matplotlib.rc_context(STYLE):
-        figure = blank_figure(7.2, 4.5)
+        figure = blank_figure(WIDTH, 4.5)
         legend = {}
         for column, (name, view) in enumerate(views.items()):
             axes = add_axes3d(figure, (0.5 * column - 0.005, 0.17, 0.46, 0.74))

@@ -19,14 +19,18 @@ from tdf_jax._internal.files import replace_file
 from tdf_jax.geometry.winding import libigl
 from tdf_jax.landscape.storage import Landscape
 from tdf_jax.viz import polygons3d
+from tdf_jax.viz.scene3d import thinned
 from tdf_jax.viz.style import (
     CENTIMETRES,
     CLOUD,
     COLOURS,
     INK,
     LIGHT,
+    MARKED,
     STYLE,
     TRUTH,
+    VIEW,
+    WAYPOINTS,
     add_axes3d,
     blank_figure,
     legend_of,
@@ -46,8 +50,6 @@ SEE_THROUGH = 0.30
 MAX_PANELS = 24  # waypoints on a map; more waypoints are subsampled evenly
 FRAMES_A_SECOND = 8
 GIF_DPI = 100
-SHOWN = 1500  # points of an object's cloud that are drawn
-ANGLES = {"elev": 22.0, "azim": -38.0}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,7 +158,7 @@ def isosurface_figure(landscape: Landscape, marks: Marks, title: str = "") -> Fi
         if marks.mesh is not None:
             pieces += polygons3d.surface(CENTIMETRES * np.asarray(marks.mesh.triangles), LIGHT)
         else:
-            cloud, size = marks.points[:: max(1, len(marks.points) // SHOWN)], cast(Any, 1.5)
+            cloud, size = thinned(marks.points), cast(Any, 1.5)
             axes.scatter(*(CENTIMETRES * cloud.T), s=size, color=CLOUD, linewidths=0)
         for share, colour in zip(LEVELS, SURFACES):
             triangles = CENTIMETRES * isosurface(landscape, share)
@@ -181,7 +183,7 @@ def isosurface_figure(landscape: Landscape, marks: Marks, title: str = "") -> Fi
             ylabel="y (cm)",
             zlabel="z (cm)",
         )
-        set_view(axes, high - low, 1.1, ANGLES)
+        set_view(axes, high - low, 1.1, VIEW)
         legend = legend_of(axes)
         figure.legend(legend.values(), legend.keys(), loc="lower center", ncols=3, frameon=False)
         figure.suptitle(title)
@@ -334,9 +336,9 @@ def path_lines(landscape: Landscape, marks: Marks, colour: str = "white") -> lis
         )
     ]
     if marks.expected is not None:
-        lines.append((marks.expected, {"color": "#e9c46a", "marker": "o", "mec": INK, "label": "true waypoints"}))
+        lines.append((marks.expected, {"color": WAYPOINTS, "marker": "o", "mec": INK, "label": "true waypoints"}))
     if marks.path is not None:
-        lines.append((marks.path, {"color": "#f4845f", "label": "lowest-cost path"}))
+        lines.append((marks.path, {"color": MARKED, "label": "lowest-cost path"}))
     return [*lines, (landscape.minimisers, _MINIMISERS)]
 
 

@@ -6,15 +6,13 @@ from collections.abc import Sequence
 import matplotlib
 import numpy as np
 from jaxtyping import Float
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from tdf_jax.viz import polygons3d
-from tdf_jax.viz.style import CENTIMETRES, INK, LIGHT, STYLE, TRUTH, add_axes3d, set_view
+from tdf_jax.viz.style import CENTIMETRES, ESTIMATE, INK, LIGHT, STYLE, TRUTH, add_axes3d, blank_figure, set_view
 
-ESTIMATE = "#2a6f97"
 VIEW = {"elev": 28.0, "azim": -55.0}  # shows the inside of a cup, and its handle to the right
 PIECES = 25  # longest edge of a drawn triangle, as a part of the diagonal; see `solid`
 COLUMNS = 5
@@ -107,8 +105,7 @@ def _figure(count: int, rows: int, title: str, edge: float) -> Figure:
     blocks = -(-count // COLUMNS)
     width = max(2 * MARGIN + min(COLUMNS, count) * PANEL, 5.2)
     height = 2 * MARGIN + blocks * (WORDS + rows * PANEL)
-    figure = Figure(figsize=(width, height), facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(width, height)
     figure.suptitle(title, y=1 - 0.1 / height, va="top")
     x, y, length = 0.2 / width, 0.17 / height, BAR / edge * PANEL / width
     figure.add_artist(Line2D([x, x + length], [y, y], color=INK, lw=2, solid_capstyle="butt"))

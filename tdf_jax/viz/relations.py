@@ -20,8 +20,8 @@ from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.solvers.result import Result
 from tdf_jax.viz import polygons3d
-from tdf_jax.viz.scene3d import MARGIN, SHOWN_POINTS, VIEW, WIDTH, bounds, frame
-from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, STYLE, TRUTH, add_axes3d, blank_figure, set_view
+from tdf_jax.viz.scene3d import MARGIN, WIDTH, bounds, frame, thinned
+from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, STYLE, TRUTH, VIEW, add_axes3d, blank_figure, set_view
 
 BEFORE, AFTER, TARGET, CONTACT = COLOURS(0.0), COLOURS(0.62), CLOUD, TRUTH
 HEIGHT = 7.2  # inches
@@ -160,7 +160,7 @@ def _draw(axes: Axes3D, side: _Side, box: np.ndarray | None) -> None:
     if box is not None:
         parts += [(side.before, BEFORE), (side.contact_before, CONTACT)]
     # One collection, because matplotlib paints the points of a collection from far to near, and one after the other.
-    shown = [part[:: -(-len(part) // SHOWN_POINTS)] for part, _ in parts]
+    shown = [thinned(part) for part, _ in parts]
     colours = np.repeat([to_rgba(colour) for _, colour in parts], [len(one) for one in shown], axis=0)
     size: Any = SIZE if box is not None else 1.6 * SIZE
     axes.computed_zorder = False

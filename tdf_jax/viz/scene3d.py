@@ -23,6 +23,7 @@ from tdf_jax.viz.style import (
     LIGHT,
     STYLE,
     TRUTH,
+    VIEW,
     add_axes3d,
     blank_figure,
     legend_of,
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 
 WIDTH = 7.2  # width of a page's text, inches
 SHOWN_POINTS = 1500  # points of a cloud; more points overlap at the width of a page
-VIEW = {"elev": 22.0, "azim": -38.0}  # the handle faces the reader, and the path runs to the right
 TICKS, LABEL = 4, -1.2  # intervals between ticks on the longest axis, and points between ticks and the axis's name
 MARGIN = 1.06  # length of the axes, in that of their contents
 MOST_TRIANGLES = 40_000  # a mesh with more triangles is drawn as points, because matplotlib would take seconds
@@ -66,13 +66,14 @@ def triangles_of(mesh: "trimesh.Trimesh | None") -> Float[np.ndarray, "faces 3 3
     return np.asarray(mesh.triangles)
 
 
-def thinned(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "shown 3"]:
-    """At most `SHOWN_POINTS` points of a cloud.
+def thinned(points: Float[np.ndarray, "points 3"], most: int = SHOWN_POINTS) -> Float[np.ndarray, "shown 3"]:
+    """Every k-th point of a cloud, so that few enough are left to draw.
 
     Args:
-        points: the cloud, (points, 3).
+        points: the cloud, (points, 3); it may have no point.
+        most: largest number of points that are left.
     """
-    return np.asarray(points, float)[:: -(-len(points) // SHOWN_POINTS)]
+    return np.asarray(points, float)[:: max(1, -(-len(points) // most))]
 
 
 def bounds(query: Float[np.ndarray, "queries 3"]) -> Float[np.ndarray, "8 3"]:

@@ -18,13 +18,12 @@ from tdf_jax.uncertainty.modes import Mode
 from tdf_jax.viz import polygons3d
 from tdf_jax.viz.motion import motion_of
 from tdf_jax.viz.scene3d import MARGIN, View, bounds, content, draw, frame, thinned, triangles_of
-from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, LIGHT, STYLE, add_axes3d, blank_figure, legend_of
+from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, ESTIMATE, LIGHT, STYLE, add_axes3d, blank_figure, legend_of
 
 if TYPE_CHECKING:
     import trimesh
 
 SIZE = 4.6, 4.2  # inches, of a new figure with one 3-D panel
-ESTIMATE = "#2a6f97"
 LEAST_RANGE = 1.05  # highest energy of a scale of colours, in the lowest: one pick has a scale too
 
 

@@ -7,7 +7,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
-from tdf_jax.viz.style import INK, STYLE, TRUTH
+from tdf_jax.viz.scene3d import WIDTH
+from tdf_jax.viz.style import ESTIMATE, INK, PALE, STYLE, TRUTH, blank_figure
 
 PANELS = (
     ("bce", "occupancy: binary cross-entropy", "log"),
@@ -26,13 +27,13 @@ def training_figure(rows: Sequence[dict]) -> Figure:
         rows: metrics of the steps, from `tdf_jax.training.run_folder.metrics`.
     """
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(7.2, 4.6), layout="constrained")
+        figure = blank_figure(WIDTH, 4.6, layout="constrained")
         axes = figure.subplots(2, 2, sharex=True)
         steps = np.array([row["step"] for row in rows])
         width = max(1, min(SMOOTH, len(rows) // 10))
         for panel, (name, label, scale) in zip(axes.flat, PANELS):
             values = np.convolve([row[name] for row in rows], np.ones(width) / width, mode="valid")
-            panel.plot(steps[width - 1 :], values, color="#9aa5b1", lw=1, label=f"training, mean of {width} steps")
+            panel.plot(steps[width - 1 :], values, color=PALE, lw=1, label=f"training, mean of {width} steps")
             for key, shown, colour in SETS:
                 measured = [(row["step"], row[key][name]) for row in rows if key in row]
                 panel.plot(*np.array(measured).reshape(-1, 2).T, color=colour, marker="o", ms=2.5, lw=1, label=shown)
@@ -44,7 +45,7 @@ def training_figure(rows: Sequence[dict]) -> Figure:
             panel.grid(color="#dddddd", lw=0.5)
         shares = [(row["step"], row["transfer"]["success"]) for row in rows if "transfer" in row]
         transfer = axes[0, 1].plot(
-            *np.array(shares).reshape(-1, 2).T, color="#2a6f97", ls="--", marker="o", ms=2.5, lw=1
+            *np.array(shares).reshape(-1, 2).T, color=ESTIMATE, ls="--", marker="o", ms=2.5, lw=1
         )
         axes[0, 0].legend(frameon=False)
         axes[0, 1].legend(transfer, ["transfers within 2 cm and 20°"], frameon=False)

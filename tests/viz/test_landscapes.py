@@ -11,7 +11,8 @@ import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry.grid import Grid, plane_grid, volume_grid
 from tdf_jax.landscape.storage import Landscape
-from tdf_jax.viz import html, landscapes as terrain
+from tdf_jax.viz import landscapes as terrain
+from tdf_jax.viz.landscape_page import save_landscape_page
 
 WAYPOINTS = np.array([[0.0, 0, 0], [0.1, 0.05, 0.1]])
 POINTS = np.random.default_rng(0).normal(size=(300, 3)) * 0.03
@@ -100,7 +101,7 @@ def test_a_page_needs_no_network(tmp_path, marks, axes, masked):
     if masked:
         landscape.values[:, 0] = np.nan
     one = dataclasses.replace(marks, mesh=tdf.build_mug().mesh) if axes == 3 else marks
-    html.save_page(tmp_path / "it.html", landscape, one, "A title")
+    save_landscape_page(tmp_path / "it.html", landscape, one, "A title")
     page = (tmp_path / "it.html").read_text()
     assert "<script src=" not in page and 'src="http' not in page
     assert len(page) < 5_000_000
@@ -109,7 +110,7 @@ def test_a_page_needs_no_network(tmp_path, marks, axes, masked):
     assert any("least 2 %" in name for name in names) == (axes == 3)
     assert ("energy" in names) == (axes == 2)
     with pytest.raises(InputError, match="cannot write"):
-        html.save_page(tmp_path / "no folder" / "it.html", landscape, one)
+        save_landscape_page(tmp_path / "no folder" / "it.html", landscape, one)
 
 
 def test_a_map_of_many_waypoints_shows_some():
@@ -136,5 +137,5 @@ def test_what_cannot_be_shown_is_refused(tmp_path, marks, monkeypatch):
         terrain.map_figure(each, marks)
     monkeypatch.setitem(__import__("sys").modules, "plotly.graph_objects", None)
     with pytest.raises(InputError, match="pip install"):
-        html.save_page(tmp_path / "it.html", plane, marks)
+        save_landscape_page(tmp_path / "it.html", plane, marks)
     assert not list(tmp_path.iterdir())

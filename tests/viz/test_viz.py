@@ -35,19 +35,19 @@ def test_both_sides_show_their_path_in_centimetres_at_one_scale(demonstration, d
     found, truth = tdf.line(num_poses=5, end=(0.1, 0.3, 0.1)), tdf.semicircle(num_poses=5, end=(0.1, 0.3, 0.1))
     moved = demonstration.points + np.float32(1.0)
     figure = imitation_figure(demonstration, moved, found, truth, title="loss 0.1")
-    reference, test, bar = figure.axes
+    left, right, bar = figure.axes
     assert figure.get_suptitle() == "loss 0.1"
-    assert (reference.get_title(), test.get_title()) == ("reference", "test")
+    assert (left.get_title(), right.get_title()) == ("demonstration", "imitation")
     path, true_path = "trajectory of the query frame", "true trajectory and pick"
-    np.testing.assert_allclose(lines(reference)[path], 100 * demonstration.trajectory.translations, atol=1e-5)
-    np.testing.assert_allclose(lines(test)[path], 100 * found.translations, atol=1e-5)
-    np.testing.assert_allclose(lines(test)[true_path], 100 * truth.translations, atol=1e-5)
-    assert true_path not in lines(reference)
+    np.testing.assert_allclose(lines(left)[path], 100 * demonstration.trajectory.translations, atol=1e-5)
+    np.testing.assert_allclose(lines(right)[path], 100 * found.translations, atol=1e-5)
+    np.testing.assert_allclose(lines(right)[true_path], 100 * truth.translations, atol=1e-5)
+    assert true_path not in lines(left)
     labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
     assert sorted(labels) == sorted(["object's points", path, true_path])
-    spans = [[np.ptp(getattr(axes, f"get_{name}lim")()) for name in "xyz"] for axes in (reference, test)]
+    spans = [[np.ptp(getattr(axes, f"get_{name}lim")()) for name in "xyz"] for axes in (left, right)]
     np.testing.assert_allclose(spans[0], spans[1], rtol=1e-6)
-    for axes, pieces in zip((reference, test), drawn, strict=True):
+    for axes, pieces in zip((left, right), drawn, strict=True):
         np.testing.assert_allclose(axes._box_aspect / axes._box_aspect[0], np.array(spans[0]) / spans[0][0], rtol=1e-6)
         assert [getattr(axes, f"get_{name}label")() for name in "xyz"] == ["x (cm)", "y (cm)", "z (cm)"]
         for points in (np.concatenate(pieces.polygons), *lines(axes).values()):

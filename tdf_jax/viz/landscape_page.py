@@ -8,22 +8,15 @@ import numpy as np
 
 from tdf_jax.landscape.storage import Landscape
 from tdf_jax.viz import polygons3d
-from tdf_jax.viz.landscapes import (
-    ANGLES,
-    LEVELS,
-    SEE_THROUGH,
-    SHOWN,
-    SURFACES,
-    Marks,
-    check_landscape,
-    isosurface,
-    path_lines,
-)
+from tdf_jax.viz.landscapes import LEVELS, SEE_THROUGH, SURFACES, Marks, check_landscape, isosurface, path_lines
 from tdf_jax.viz.page import Page, camera, page_of, pages, scene_axes
-from tdf_jax.viz.style import CENTIMETRES, CLOUD, INK
+from tdf_jax.viz.scene3d import thinned
+from tdf_jax.viz.style import CENTIMETRES, CLOUD, INK, VIEW
+
+DISTANCE = 2.2  # of the camera, in the size of the scene
 
 
-def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title: str = "") -> None:
+def save_landscape_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title: str = "") -> None:
     """Write an interactive .html page of a landscape that opens without a network.
 
     A plane is drawn as a surface of energies, a volume as surfaces of equal energy.
@@ -38,11 +31,11 @@ def save_page(path: str | os.PathLike, landscape: Landscape, marks: Marks, title
         InputError: the grid has one axis, the landscape keeps every rotation, plotly (or, for a volume, libigl) is not
             installed, the page would be too large to pass on, or the file cannot be written.
     """
-    landscape_page("save_page()", landscape, marks, title).save(path)
+    landscape_page("save_landscape_page()", landscape, marks, title).save(path)
 
 
 def landscape_page(function: str, landscape: Landscape, marks: Marks, title: str = "") -> Page:
-    """The page of a landscape; see `save_page`.
+    """The page of a landscape; see `save_landscape_page`.
 
     Args:
         function: name that error messages begin with.
@@ -88,7 +81,7 @@ def landscape_page(function: str, landscape: Landscape, marks: Marks, title: str
             )
         )
     else:
-        x, y, z = CENTIMETRES * marks.points[:: max(1, len(marks.points) // SHOWN)].T
+        x, y, z = CENTIMETRES * thinned(marks.points).T
         drawn.append(
             plotly.Scatter3d(x=x, y=y, z=z, mode="markers", marker={"size": 1.5, "color": CLOUD}, name="object")
         )
@@ -102,7 +95,7 @@ def landscape_page(function: str, landscape: Landscape, marks: Marks, title: str
     lines = [CENTIMETRES * line for line, _ in path_lines(landscape, marks, CLOUD)]
     shown = np.concatenate([points.reshape(-1, 3), CENTIMETRES * np.asarray(content), *lines])
     margin = 0.03 * np.ptp(shown, axis=0)  # plotly cuts what lies on the end of an axis
-    scene = scene_axes(shown.min(axis=0) - margin, shown.max(axis=0) + margin) | {"camera": camera(ANGLES, 2.2)}
+    scene = scene_axes(shown.min(axis=0) - margin, shown.max(axis=0) + margin) | {"camera": camera(VIEW, DISTANCE)}
     legend = {"x": 0, "y": 1, "bgcolor": "rgba(255,255,255,0.6)"}
     font = {"color": INK, "size": 13}
     figure.update_layout(scene=scene, legend=legend, font=font, margin={"l": 0, "r": 0, "b": 0, "t": 0})
