@@ -119,7 +119,7 @@ def _simulated(folder: Path) -> Path | None:
 def _demonstrate(file: Path, path: Path, scale: float, port: int, share: bool, no_browser: bool) -> None:
     from tdf_jax.io.meshes import load_mesh
     from tdf_jax.io.pointclouds import load_points
-    from tdf_jax.viewer.demonstrating import HandStage, check_demonstration_path
+    from tdf_jax.viewer.demonstrating import DemonstrationStage, check_demonstration_path
     from tdf_jax.viewer.local_server import serving
 
     check_demonstration_path("tdf view", path)
@@ -129,7 +129,7 @@ def _demonstrate(file: Path, path: Path, scale: float, port: int, share: bool, n
     except InputError:  # the file has no faces; it has just been read as a cloud
         mesh = None
     with serving("tdf view", port) as server:
-        HandStage(server, points, path, mesh)
+        DemonstrationStage(server, points, path, mesh)
         _wait(server, share, no_browser)
 
 

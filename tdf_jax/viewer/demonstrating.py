@@ -97,7 +97,7 @@ def demonstration_of(
     return Demonstration(cloud, trajectory, query, draft.grasp, draft.release).resampled(num_poses)
 
 
-class HandStage:
+class DemonstrationStage:
     """A cloud on the screen, on which a demonstration is made by hand.
 
     Args:

@@ -8,7 +8,7 @@ from tdf_jax._internal.errors import InputError
 from tdf_jax.landscape.storage import Landscape
 from tdf_jax.viewer import handles
 from tdf_jax.viz.landscapes import LEVELS, SURFACES, isosurface
-from tdf_jax.viz.style import TRUTH
+from tdf_jax.viz.style import TRUTH, WAYPOINTS
 
 
 def show_landscape(server: Any, landscape: Landscape) -> None:
@@ -26,7 +26,7 @@ def show_landscape(server: Any, landscape: Landscape) -> None:
         )
     low, high = float(np.nanmin(energy)), float(np.nanmax(energy))
     marks = [
-        handles.add_path(server, "/landscape/waypoints", landscape.waypoints, "#e9c46a"),
+        handles.add_path(server, "/landscape/waypoints", landscape.waypoints, WAYPOINTS),
         handles.add_cloud(server, "/landscape/minimisers", landscape.minimisers, TRUTH),
     ]
     marks[1].point_size = 0.008

@@ -7,8 +7,8 @@ from jaxtyping import Array, Float
 from matplotlib.colors import to_rgb
 
 from tdf_jax.viz import polygons3d
-from tdf_jax.viz.scene3d import MOST_TRIANGLES, VIEW, bounds
-from tdf_jax.viz.style import COLOURS
+from tdf_jax.viz.scene3d import MOST_TRIANGLES, bounds, thinned
+from tdf_jax.viz.style import COLOURS, VIEW
 
 POINT, LINE = 0.0022, 0.0016  # metres: edge of a point, thickness of a line
 FIELD_OF_VIEW = 45.0  # degrees
@@ -44,7 +44,7 @@ def add_cloud(server: Any, name: str, points: Float[np.ndarray, "points 3"], col
         points: the points, (points, 3).
         colour: their colour.
     """
-    shown = np.asarray(points, np.float32)[:: -(-len(points) // MOST_POINTS)]
+    shown = thinned(points, MOST_POINTS).astype(np.float32)
     return server.scene.add_point_cloud(
         name, shown, rgb(colour), point_size=POINT, point_shape="circle", precision="float32", point_shading="flat"
     )

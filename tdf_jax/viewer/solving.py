@@ -99,7 +99,7 @@ class ToTarget:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Found:
+class Solution:
     """A pick with its path, as the viewer shows it.
 
     Attributes:
@@ -125,6 +125,12 @@ class Found:
     seconds: tuple[float, float] | None = None
     tracked: bool = True
     to_target: ToTarget | None = None
+
+    @property
+    def pick_in_place(self) -> Float[np.ndarray, "7"]:
+        """The pick on the object in its initial pose, where it was before it was dragged, `wxyz_xyz`, (7,)."""
+        back = se3.inverse(jnp.asarray(self.motion, jnp.float32))
+        return np.asarray(se3.compose(back, jnp.asarray(self.pick, jnp.float32)))
 
 
 def model_of(scene: ImitationScene, weights: str | None) -> Model:
@@ -177,7 +183,7 @@ def problem_of(scene: ImitationScene, model: Model) -> Problem:
     return Problem(scene, model, describe(model, alone), np.asarray(scene.points)[np.asarray(kept)], field)
 
 
-def chosen(problem: Problem, number: int) -> Found:
+def chosen(problem: Problem, number: int) -> Solution:
     """The result of the folder: one of its distinct picks.
 
     Args:
@@ -204,10 +210,10 @@ def chosen(problem: Problem, number: int) -> Found:
     )
     to_target = _to_target(problem, index) if problem.placed else None
     ends = path[result.grasp], path[result.release]
-    return Found(*ends, path, energy, IDENTITY.copy(), alone, confident, to_target=to_target)
+    return Solution(*ends, path, energy, IDENTITY.copy(), alone, confident, to_target=to_target)
 
 
-def dragged(problem: Problem, motion: Float[np.ndarray, "7"], last: Found) -> Found:
+def dragged(problem: Problem, motion: Float[np.ndarray, "7"], last: Solution) -> Solution:
     """Find the pick on the object where it was dragged to, from the last pick.
 
     The object is encoded anew there, as if a camera saw it. The goal is that of the last result; an object that is
@@ -233,10 +239,10 @@ def dragged(problem: Problem, motion: Float[np.ndarray, "7"], last: Found) -> Fo
     seconds = (encoded - began, time.perf_counter() - encoded)
     path = path_between(problem, pick, goal, last.to_target)
     confident = _confidence(problem, energy)
-    return Found(pick, goal, path, energy, np.asarray(motion), result, confident, seconds, tracked, last.to_target)
+    return Solution(pick, goal, path, energy, np.asarray(motion), result, confident, seconds, tracked, last.to_target)
 
 
-def regoaled(problem: Problem, goal: Float[np.ndarray, "7"], last: Found) -> Found:
+def with_goal(problem: Problem, goal: Float[np.ndarray, "7"], last: Solution) -> Solution:
     """The same pick, with the demonstration warped to another goal; the arrival at a target moves with the goal.
 
     Args:
@@ -284,19 +290,6 @@ def path_between(
         se3.compose(se3.compose(transfer[-1], se3.inverse(demonstrated[-1])), reference.retreat),
     ]
     return np.concatenate([np.asarray(part).reshape(-1, 7) for part in parts])
-
-
-def energy_at(problem: Problem, found: Found, pose: Float[np.ndarray, "7"]) -> float:
-    """Energy of the pick's descriptors at a pose of the query frame (eq. 2 of one waypoint).
-
-    Args:
-        problem: the problem.
-        found: the result, whose object the pose is at.
-        pose: T_world_query, `wxyz_xyz`, (7,).
-    """
-    # In the initial pose of the object, whose field is known: the network turns with its cloud.
-    pose = se3.compose(se3.inverse(jnp.asarray(found.motion, jnp.float32)), jnp.asarray(pose, jnp.float32))
-    return problem.energy_in_place(pose)
 
 
 def _to_target(problem: Problem, index: int) -> ToTarget:
@@ -359,7 +352,7 @@ def reconstructed(problem: Problem) -> Float[np.ndarray, "faces 3 3"]:
     return surface_triangles(problem.field, np.eye(4), bounds)
 
 
-def _searched(field: DescriptorField, reference: Reference, last: Found) -> tuple[Result, bool]:
+def _searched(field: DescriptorField, reference: Reference, last: Solution) -> tuple[Result, bool]:
     """The pick by `track`, or by `carry` where that is lost or has nothing to begin with; and which of the two."""
     ends: dict[str, Any] = {"goal": jnp.asarray(last.goal)}
     if reference.trajectory.num_poses == 1:

@@ -4,28 +4,25 @@ import threading
 import time
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from tdf_jax._internal.errors import InputError
-from tdf_jax.geometry import se3
 from tdf_jax.landscape.storage import Landscape
 from tdf_jax.viewer import handles, solving
 from tdf_jax.viewer.energies import show_landscape
 from tdf_jax.viewer.player import Player
-from tdf_jax.viewer.solving import Found, Problem
+from tdf_jax.viewer.solving import Problem, Solution
 from tdf_jax.viewer.worker import Worker
 from tdf_jax.viz.imitation_page import above
 from tdf_jax.viz.motion import motion_of
-from tdf_jax.viz.scene3d import VIEW
-from tdf_jax.viz.style import CLOUD, COLOURS, INK, TRUTH
+from tdf_jax.viz.style import CLOUD, COLOURS, ESTIMATE, INK, MARKED, TRUTH, VIEW
 
 STEP = 0.1  # of the time slider, poses
 POSES_A_SECOND = 2.0
 BESIDE, OVER, HIDDEN = "beside", "over it", "hidden"
-BOX, SURFACE, PROBE = COLOURS(0.35), "#7aa6c2", "#f4845f"
+BOX, SURFACE, PROBE = COLOURS(0.35), ESTIMATE, MARKED
 REACH = 0.006  # metres from the ray of a click within which a point is hit
 SHOWN_MODES = 12
 SURFACE_NAME = "reconstructed surface"
@@ -44,12 +41,12 @@ class Stage:
 
     def __init__(self, server: Any, problem: Problem, landscape: Landscape | None = None):
         self.server, self.problem = server, problem
-        self.found = solving.chosen(problem, 0)
+        self.solution = solving.chosen(problem, 0)
         self.worker = Worker(self._say)
         self._centroid = np.asarray(problem.points, float).mean(axis=0)
         self._draw()
         self._panel(landscape)
-        self._show(self.found)
+        self._show(self.solution)
         self._waiting: threading.Timer | None = None
         server.on_client_connect(lambda _: self._seen())
 
@@ -82,10 +79,10 @@ class Stage:
             "cloud": [handles.add_cloud(server, "/imitation/object/cloud", scene.points, COLOURS(0.0))],
             "mesh": [handles.add_mesh(server, "/imitation/object/mesh", scene.meshes[1])],
         }
-        self._path = handles.add_path(server, "/imitation/path", self.found.path[:, 4:], INK)
+        self._path = handles.add_path(server, "/imitation/path", self.solution.path[:, 4:], INK)
         self._box = handles.add_box(server, "/imitation/box", demonstration.query, BOX, 1.6 * handles.LINE)
         self._boxes: list[Any] = []
-        self._fit(len(self.found.path))
+        self._fit(len(self.solution.path))
         self._draw_picks()
         if scene.expected is not None:
             truth = np.asarray(scene.expected.wxyz_xyz)
@@ -146,13 +143,13 @@ class Stage:
     def _draw_demonstration(self) -> None:
         scene, server = self.problem.scene, self.server
         demonstration = scene.demonstration
-        self._shown = server.scene.add_frame("/demonstration", show_axes=False)
-        self._shown_object = server.scene.add_frame("/demonstration/object", show_axes=False)
+        self._demonstrated = server.scene.add_frame("/demonstration", show_axes=False)
+        self._demonstrated_object = server.scene.add_frame("/demonstration/object", show_axes=False)
         cloud = handles.add_cloud(server, "/demonstration/object/cloud", np.asarray(demonstration.points), CLOUD)
         self._nodes["cloud"].append(cloud)
         self._nodes["mesh"].append(handles.add_mesh(server, "/demonstration/object/mesh", scene.meshes[0]))
         handles.add_path(server, "/demonstration/path", np.asarray(demonstration.trajectory.translations), CLOUD)
-        self._shown_box = handles.add_box(server, "/demonstration/box", demonstration.query, BOX, handles.LINE)
+        self._demonstrated_box = handles.add_box(server, "/demonstration/box", demonstration.query, BOX, handles.LINE)
         if demonstration.target is not None:
             node = handles.add_cloud(server, "/demonstration/target", np.asarray(demonstration.target.points), CLOUD)
             self._nodes["target"].append(node)
@@ -164,7 +161,7 @@ class Stage:
         return float(np.linalg.norm(np.ptp(self.problem.points, axis=0)))
 
     def _contents(self) -> np.ndarray:
-        return np.concatenate([self.problem.points, self.found.path[:, 4:]])
+        return np.concatenate([self.problem.points, self.solution.path[:, 4:]])
 
     def _look(self) -> None:
         """Place the demonstration to the left of the imitation, and the camera before both."""
@@ -192,10 +189,10 @@ class Stage:
         self._nodes[SURFACE_NAME] = [node]
 
     def _prepare(self) -> None:
-        last = self.found
+        last = self.solution
         solving.dragged(self.problem, last.motion, last)
-        solving.regoaled(self.problem, last.goal, last)
-        solving.energy_at(self.problem, last, last.pick)
+        solving.with_goal(self.problem, last.goal, last)
+        self.problem.energy_in_place(last.pick_in_place)
         self._say("Ready: drag the object or its goal.")
 
     # The panel
@@ -205,7 +202,7 @@ class Stage:
         self._summary = gui.add_markdown("")
         self._status = gui.add_markdown("Preparing the solver ...")
         with gui.add_folder("Time"):
-            last = len(self.found.path) - 1
+            last = len(self.solution.path) - 1
             self.player = Player(gui, "pose", last, STEP, result.grasp, POSES_A_SECOND, self._show_time)
         with gui.add_folder("Picks"):
             modes = self.problem.modes[:SHOWN_MODES]
@@ -253,8 +250,8 @@ class Stage:
         self._set_visible(SURFACE_NAME, value)
 
     def _put_demonstration(self, where: str) -> None:
-        self._shown.visible = where != HIDDEN
-        self._shown.position = self._beside if where == BESIDE else np.zeros(3)
+        self._demonstrated.visible = where != HIDDEN
+        self._demonstrated.position = self._beside if where == BESIDE else np.zeros(3)
 
     def _say(self, text: str) -> None:
         self._status.content = text
@@ -273,10 +270,10 @@ class Stage:
 
     def _solve(self, motion: Float[np.ndarray, "7"]) -> None:
         began = time.perf_counter()
-        found = solving.dragged(self.problem, motion, self.found)
-        self._show(found)
-        encoding, search = found.seconds or (0.0, 0.0)
-        how = "" if found.tracked else " The pick was lost, and is found by a search from many starts."
+        solution = solving.dragged(self.problem, motion, self.solution)
+        self._show(solution)
+        encoding, search = solution.seconds or (0.0, 0.0)
+        how = "" if solution.tracked else " The pick was lost, and is found by a search from many starts."
         seconds = time.perf_counter() - began
         self._say(f"Solved in {seconds:.2f} s: encoding {encoding:.2f} s, search {search:.2f} s.{how}")
 
@@ -285,7 +282,7 @@ class Stage:
 
         def move():
             began = time.perf_counter()
-            self._show(solving.regoaled(self.problem, goal, self.found), goal=False)
+            self._show(solving.with_goal(self.problem, goal, self.solution), goal=False)
             self._say(f"The path follows the goal, in {time.perf_counter() - began:.3f} s.")
 
         self.worker.ask("goal", move)
@@ -314,8 +311,7 @@ class Stage:
         Args:
             point: a point of the object in its initial pose, (3,), metres.
         """
-        found = self.found
-        pick = np.asarray(se3.compose(se3.inverse(jnp.asarray(found.motion, jnp.float32)), jnp.asarray(found.pick)))
+        pick = self.solution.pick_in_place
         R = Rotation.from_quat(pick[:4], scalar_first=True).as_matrix()
         middle = np.asarray(self.problem.reference.query, float).mean(axis=0)
         pose = np.concatenate([pick[:4], point - R @ middle])
@@ -323,51 +319,51 @@ class Stage:
         handles.place(self._probe, pose[:4], pose[4:])
         self._probe.visible = True
         away = np.linalg.norm(pose[4:] - pick[4:])
-        times = f", {energy / self.found.energy:.1f} times that of the pick" if self.found.energy > 0 else ""
+        times = f", {energy / self.solution.energy:.1f} times that of the pick" if self.solution.energy > 0 else ""
         self._energy.content = (
             f"Energy **{energy:.4f}** there{times}: {100 * away:.1f} cm from the pick, in its orientation."
         )
 
     # What changes
 
-    def _show(self, found: Found, goal: bool = True) -> None:
+    def _show(self, solution: Solution, goal: bool = True) -> None:
         with self.player.lock, self.server.atomic():
-            self.found = found
-            self._path.points = handles.path_segments(found.path[:, 4:]).astype(np.float32)
-            self._fit(len(found.path))
-            self.player.extend(len(found.path) - 1)
-            for node, pose in zip(self._boxes, found.path, strict=True):
+            self.solution = solution
+            self._path.points = handles.path_segments(solution.path[:, 4:]).astype(np.float32)
+            self._fit(len(solution.path))
+            self.player.extend(len(solution.path) - 1)
+            for node, pose in zip(self._boxes, solution.path, strict=True):
                 handles.place(node, pose[:4], pose[4:])
             if goal:
-                handles.place(self._goal, found.goal[:4], found.goal[4:])
-            self._summary.content = _words(found)
+                handles.place(self._goal, solution.goal[:4], solution.goal[4:])
+            self._summary.content = _words(solution)
             self._show_time()
 
     def _show_time(self) -> None:
         result, demonstration = self.problem.scene.result, self.problem.scene.demonstration
-        index = np.array([min(self.player.value, len(self.found.path) - 1.0)])
+        index = np.array([min(self.player.value, len(self.solution.path) - 1.0)])
         with self.player.lock, self.server.atomic():
-            motion = motion_of(self.found.path, result.grasp, result.release, index)
+            motion = motion_of(self.solution.path, result.grasp, result.release, index)
             self._put(self._box, motion.rotations[0], motion.translations[0])
-            R = Rotation.from_quat(self.found.motion[:4], scalar_first=True).as_matrix()
+            R = Rotation.from_quat(self.solution.motion[:4], scalar_first=True).as_matrix()
             held = motion.object_rotations[0]
-            self._put(self._object, held @ R, held @ self.found.motion[4:] + motion.object_translations[0])
+            self._put(self._object, held @ R, held @ self.solution.motion[4:] + motion.object_translations[0])
             shown = np.asarray(demonstration.trajectory.wxyz_xyz)
-            share = index * (len(shown) - 1) / max(1, len(self.found.path) - 1)
+            share = index * (len(shown) - 1) / max(1, len(self.solution.path) - 1)
             motion = motion_of(shown, demonstration.grasp, demonstration.release, share)
-            self._put(self._shown_box, motion.rotations[0], motion.translations[0])
-            self._put(self._shown_object, motion.object_rotations[0], motion.object_translations[0])
+            self._put(self._demonstrated_box, motion.rotations[0], motion.translations[0])
+            self._put(self._demonstrated_object, motion.object_rotations[0], motion.object_translations[0])
 
     def _put(self, node: Any, R: np.ndarray, t: np.ndarray) -> None:
         handles.place(node, Rotation.from_matrix(R).as_quat(scalar_first=True), t)
 
 
-def _words(found: Found) -> str:
+def _words(solution: Solution) -> str:
     """The pick in a few lines."""
-    x, y, z = 100 * np.asarray(found.pick[4:], float)
-    lines = [f"**Pick** x {x:.1f}, y {y:.1f}, z {z:.1f} cm", f"**Energy** {found.energy:.5f}"]
-    if np.isfinite(found.confidence):
-        lines.append(f"**Confidence** {found.confidence:.2f} that it is right to 2 cm and 20°")
+    x, y, z = 100 * np.asarray(solution.pick[4:], float)
+    lines = [f"**Pick** x {x:.1f}, y {y:.1f}, z {z:.1f} cm", f"**Energy** {solution.energy:.5f}"]
+    if np.isfinite(solution.confidence):
+        lines.append(f"**Confidence** {solution.confidence:.2f} that it is right to 2 cm and 20°")
     return "  \n".join(lines)
 
 

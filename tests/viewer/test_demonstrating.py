@@ -10,7 +10,7 @@ import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
 from tdf_jax.viewer import demonstrating
-from tdf_jax.viewer.demonstrating import Draft, HandStage, added, demonstration_of, undone
+from tdf_jax.viewer.demonstrating import DemonstrationStage, Draft, added, demonstration_of, undone
 from tdf_jax.viewer.local_server import address, serving
 
 CLOUD = random_cloud(0)
@@ -84,7 +84,7 @@ def test_a_name_that_cannot_be_saved_is_refused_at_once(tmp_path):
 def by_hand(tmp_path):
     pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
     with serving("test", 0) as server:
-        yield HandStage(server, CLOUD, tmp_path / "demo.npz")
+        yield DemonstrationStage(server, CLOUD, tmp_path / "demo.npz")
 
 
 def put(stage, pose):
@@ -142,7 +142,7 @@ def test_another_mug_imitates_what_was_made_by_hand(tmp_path):
     pair = generated_case("mug", 61, 0, points=1500)
     handle = np.asarray(tdf.Trajectory.from_matrices(np.stack([pair.T_world_place_a] * 2)).wxyz_xyz[0], float)
     with serving("test", 0) as server:
-        stage = HandStage(server, pair.points_a, tmp_path / "demo.npz")
+        stage = DemonstrationStage(server, pair.points_a, tmp_path / "demo.npz")
         for offset, mark in (((0, 0, 0), "grasp"), ((0, 0, 0.15), None), ((0.2, 0, 0.15), "release")):
             put(stage, handle + np.array([0, 0, 0, 0, *offset]))
             stage.change(lambda mark=mark: added(stage.draft, stage.pose, mark))

@@ -50,7 +50,7 @@ def test_a_chosen_pick_is_that_of_the_result(problem, scene):
         found = solving.chosen(problem, number)
         np.testing.assert_array_equal(found.pick, mode.pose)
         assert found.energy == mode.energy and found.seconds is None
-        np.testing.assert_allclose(solving.energy_at(problem, found, found.pick), mode.energy, rtol=1e-3)
+        np.testing.assert_allclose(problem.energy_in_place(found.pick_in_place), mode.energy, rtol=1e-3)
         path = solving.path_between(problem, found.pick, found.goal)
         np.testing.assert_allclose(path, found.path, atol=1e-5)
 
@@ -58,7 +58,7 @@ def test_a_chosen_pick_is_that_of_the_result(problem, scene):
 def test_a_goal_is_the_end_of_the_path(problem):
     found = solving.chosen(problem, 0)
     goal = found.goal + np.float32([0, 0, 0, 0, 0.1, -0.2, 0.05])
-    moved = solving.regoaled(problem, goal, found)
+    moved = solving.with_goal(problem, goal, found)
     np.testing.assert_allclose(moved.path[-1], goal, atol=1e-5)
     np.testing.assert_array_equal(moved.pick, found.pick)
     expected = tdf.carry_trajectory(problem.reference.trajectory, jnp.asarray(found.pick), jnp.asarray(goal))
@@ -109,7 +109,7 @@ def test_the_pick_follows_a_dragged_object():
         np.testing.assert_allclose(found.pick[4:], expected[4:], atol=0.002)
         assert abs(found.pick[:4] @ expected[:4]) > np.cos(np.radians(2) / 2)
         np.testing.assert_allclose(found.energy, last.energy, rtol=0.05)
-        np.testing.assert_allclose(solving.energy_at(problem, found, found.pick), found.energy, rtol=0.02)
+        np.testing.assert_allclose(problem.energy_in_place(found.pick_in_place), found.energy, rtol=0.02)
         np.testing.assert_array_equal(found.goal, last.goal)
         assert found.tracked
         assert found.confidence == pytest.approx(float(result.confidence), abs=0.05) and min(found.seconds) > 0
@@ -127,18 +127,18 @@ def test_the_path_to_a_target_is_that_of_the_result(placed, number):
 def test_the_arrival_at_a_target_moves_with_the_goal(placed):
     last = solving.chosen(placed, 0)
     shift = np.float32([0, 0, 0, 0, 0.1, -0.2, 0.05])
-    moved = solving.regoaled(placed, last.goal + shift, last)
+    moved = solving.with_goal(placed, last.goal + shift, last)
     assert moved.path.shape == last.path.shape
     np.testing.assert_allclose(moved.path[-3:], last.path[-3:] + shift, atol=1e-4)
     np.testing.assert_allclose(moved.path[0], last.path[0], atol=1e-4)
-    back = solving.regoaled(placed, last.goal, moved)
+    back = solving.with_goal(placed, last.goal, moved)
     np.testing.assert_allclose(back.path, last.path, atol=1e-4)
 
 
 def test_energies_of_picks_for_a_target_are_without_the_contact_regions(placed):
     last = solving.chosen(placed, 0)
     assert last.energy < placed.modes[0].energy
-    assert last.energy == solving.energy_at(placed, last, last.pick)
+    assert last.energy == placed.energy_in_place(last.pick_in_place)
     still = solving.dragged(placed, solving.IDENTITY, last)
     np.testing.assert_allclose(still.energy, last.energy, rtol=0.1)
 

@@ -49,10 +49,10 @@ def test_what_is_placed_on_a_target_is_dragged_as_well(placed_scene, small_model
             count = placed_scene.result.trajectories.shape[1]
             drag(shown, shown._grip, shown._centroid + [0, 0, 0.05])
             assert "Solved in" in shown._status.content
-            drag(shown, shown._goal, shown.found.goal[4:] + [0.1, 0, 0])
+            drag(shown, shown._goal, shown.solution.goal[4:] + [0.1, 0, 0])
             assert "The path follows" in shown._status.content
-            assert count == len(shown.found.path) == len(shown._boxes) == shown.player.slider.max + 1
-            np.testing.assert_allclose(shown._boxes[-1].position, shown.found.path[-1, 4:], atol=1e-6)
+            assert count == len(shown.solution.path) == len(shown._boxes) == shown.player.slider.max + 1
+            np.testing.assert_allclose(shown._boxes[-1].position, shown.solution.path[-1, 4:], atol=1e-6)
         finally:
             shown.close()
 
@@ -81,36 +81,36 @@ def test_the_panel_lists_every_distinct_pick_with_how_much_worse_it_is(shown, pr
 
 
 def test_an_object_that_is_dragged_is_solved_again(shown, problem):
-    before = shown.found
+    before = shown.solution
     drag(shown, shown._grip, shown._centroid + [0, 0, 0.05])
-    np.testing.assert_allclose(shown.found.motion, [1, 0, 0, 0, 0, 0, 0.05], atol=1e-9)
-    assert shown.found.energy <= before.energy * 1.05  # the field moves with its cloud
-    assert np.linalg.norm(shown.found.pick[4:] - before.pick[4:]) > 0.01
+    np.testing.assert_allclose(shown.solution.motion, [1, 0, 0, 0, 0, 0, 0.05], atol=1e-9)
+    assert shown.solution.energy <= before.energy * 1.05  # the field moves with its cloud
+    assert np.linalg.norm(shown.solution.pick[4:] - before.pick[4:]) > 0.01
     assert "Solved in" in shown._status.content and "encoding" in shown._status.content
-    x, y, z = 100 * shown.found.pick[4:]
+    x, y, z = 100 * shown.solution.pick[4:]
     assert f"x {x:.1f}, y {y:.1f}, z {z:.1f} cm" in shown._summary.content
-    np.testing.assert_allclose(shown._path.points[0, 0], shown.found.path[0, 4:], atol=1e-6)
+    np.testing.assert_allclose(shown._path.points[0, 0], shown.solution.path[0, 4:], atol=1e-6)
 
 
 def test_a_goal_that_is_dragged_takes_the_path_along(shown):
-    before = shown.found
+    before = shown.solution
     drag(shown, shown._goal, before.goal[4:] + [0.1, 0, 0])
-    np.testing.assert_allclose(shown.found.path[-1, 4:], before.goal[4:] + [0.1, 0, 0], atol=1e-5)
-    np.testing.assert_array_equal(shown.found.pick, before.pick)
-    np.testing.assert_allclose(shown._boxes[-1].position, shown.found.path[-1, 4:], atol=1e-6)
+    np.testing.assert_allclose(shown.solution.path[-1, 4:], before.goal[4:] + [0.1, 0, 0], atol=1e-5)
+    np.testing.assert_array_equal(shown.solution.pick, before.pick)
+    np.testing.assert_allclose(shown._boxes[-1].position, shown.solution.path[-1, 4:], atol=1e-6)
 
 
 def test_the_object_is_carried_between_grasp_and_release(shown):
-    shown.player.value = len(shown.found.path) - 1
+    shown.player.value = len(shown.solution.path) - 1
     shown._show_time()
     motion = np.asarray(shown.problem.scene.result.object_motion)
     np.testing.assert_allclose(shown._object.position, motion[4:], atol=1e-5)
     np.testing.assert_allclose(abs(shown._object.wxyz @ motion[:4]), 1, atol=1e-6)
-    np.testing.assert_allclose(shown._box.position, shown.found.path[-1, 4:], atol=1e-6)
+    np.testing.assert_allclose(shown._box.position, shown.solution.path[-1, 4:], atol=1e-6)
 
 
 def test_an_object_that_is_dragged_while_it_is_held_stays_at_its_handle(shown):
-    shown.player.value = len(shown.found.path) - 1
+    shown.player.value = len(shown.solution.path) - 1
     drag(shown, shown._grip, shown._centroid + [0, 0, 0.05])
     assert shown.player.value == shown.problem.scene.result.grasp
     np.testing.assert_allclose(shown._object.position, [0, 0, 0.05], atol=1e-6)
@@ -118,7 +118,7 @@ def test_an_object_that_is_dragged_while_it_is_held_stays_at_its_handle(shown):
 
 def test_the_point_that_is_clicked_is_that_of_the_held_object(shown, problem):
     drag(shown, shown._grip, shown._centroid + [0, 0, 0.05])
-    shown.player.value = len(shown.found.path) - 1
+    shown.player.value = len(shown.solution.path) - 1
     shown._show_time()
     R = Rotation.from_quat(shown._object.wxyz, scalar_first=True)
     point = R.apply(problem.points[7]) + shown._object.position
@@ -188,7 +188,7 @@ def test_playing_ends_at_the_last_pose(shown):
     until = time.monotonic() + SECONDS
     while shown.player.playing and time.monotonic() < until:
         time.sleep(0.01)
-    assert shown.player.button.label == "Play" and shown.player.value == len(shown.found.path) - 1
+    assert shown.player.button.label == "Play" and shown.player.value == len(shown.solution.path) - 1
 
 
 def test_an_energy_is_shown_at_the_point_that_is_clicked(shown, problem):
@@ -203,7 +203,7 @@ def test_an_energy_is_shown_at_the_point_that_is_clicked(shown, problem):
     middle = R.apply(np.asarray(problem.reference.query).mean(axis=0)) + shown._probe.position
     np.testing.assert_allclose(middle, point, atol=1e-6)
     pose = np.concatenate([shown._probe.wxyz, shown._probe.position])
-    assert f"**{solving.energy_at(problem, shown.found, pose):.4f}**" in shown._energy.content
+    assert f"**{problem.energy_in_place(pose):.4f}**" in shown._energy.content
     shown._clicked(type("Event", (), {"ray_origin": (9.0, 9, 9), "ray_direction": (0.0, 0.0, 1.0)})())
     assert shown._energy.content == "No point of the object's cloud is there."
 
@@ -213,9 +213,9 @@ def test_another_pick_is_shown_and_the_result_comes_back(shown, problem):
     number = len(problem.modes) - 1
     shown._choose(number)
     assert shown.worker.wait(SECONDS)
-    np.testing.assert_array_equal(shown.found.pick, problem.modes[number].pose)
+    np.testing.assert_array_equal(shown.solution.pick, problem.modes[number].pose)
     np.testing.assert_array_equal(shown._grip.position, shown._centroid)
-    np.testing.assert_array_equal(shown.found.motion, solving.IDENTITY)
+    np.testing.assert_array_equal(shown.solution.motion, solving.IDENTITY)
 
 
 @pytest.mark.parametrize("grid", [plane_grid(0.2, 4), volume_grid(0.2, 4)], ids=["plane", "volume"])
@@ -251,9 +251,9 @@ def test_a_real_mouse_drags_the_object_in_a_browser_and_the_pick_changes(shown, 
     tab.wait_for_timeout(3000)
     before, text = tab.screenshot(), tab.inner_text("body")
     assert colours_of(before) > 300 and received[0] < 10_000_000
-    x, y, z = 100 * shown.found.pick[4:]
+    x, y, z = 100 * shown.solution.pick[4:]
     assert f"x {x:.1f}, y {y:.1f}, z {z:.1f} cm" in text
-    pick = shown.found.pick
+    pick = shown.solution.pick
     arrow = shown._grip.position + [0, 0, 0.75 * stage.GRIP * shown._size()]  # on the arrow that points up
     begin, end = on_screen(shown.server, arrow), on_screen(shown.server, arrow + [0, 0, 0.06])
     tab.mouse.move(*begin)
@@ -262,11 +262,11 @@ def test_a_real_mouse_drags_the_object_in_a_browser_and_the_pick_changes(shown, 
     tab.mouse.up()
     tab.wait_for_selector("text=Solved in", timeout=1000 * SECONDS)
     assert shown.worker.wait(SECONDS)
-    np.testing.assert_allclose(shown.found.motion[4:6], 0, atol=1e-6)
-    assert 0.02 < shown.found.motion[6] < 0.15
-    assert np.linalg.norm(shown.found.pick[4:] - pick[4:]) > 0.01
+    np.testing.assert_allclose(shown.solution.motion[4:6], 0, atol=1e-6)
+    assert 0.02 < shown.solution.motion[6] < 0.15
+    assert np.linalg.norm(shown.solution.pick[4:] - pick[4:]) > 0.01
     tab.wait_for_timeout(1000)
-    x, y, z = 100 * shown.found.pick[4:]
+    x, y, z = 100 * shown.solution.pick[4:]
     assert f"x {x:.1f}, y {y:.1f}, z {z:.1f} cm" in tab.inner_text("body")
     assert tab.screenshot() != before
     tab.close()
