@@ -55,7 +55,7 @@ def failure_scene(task: Task, attempt: Attempt) -> ImitationScene:
         task: the task.
         attempt: the attempt of a method on it.
     """
-    case = task.case
+    case, known = task.case, confidence(attempt.residual)
     result = Result(
         trajectories=attempt.trajectories,
         energies=attempt.scores,
@@ -63,7 +63,7 @@ def failure_scene(task: Task, attempt: Attempt) -> ImitationScene:
         candidate_history=np.zeros((len(attempt.scores), 0)),
         initial_trajectories=attempt.trajectories,
         history=np.zeros((len(attempt.scores), 0)),
-        confidence=np.float32(np.nan if (known := confidence(attempt.residual)) is None else known),
+        confidence=np.asarray(np.nan if known is None else known, np.float32),
     )
     if np.asarray(result.finite).any():
         seen = points_at(case.points_b, result.pick, task.demonstration.query)

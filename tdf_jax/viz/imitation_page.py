@@ -124,10 +124,10 @@ def _draw(plotly, drawn: list, moving: list[dict], name: str, panel: Side, box: 
     shares = {"scene": name, "name": "object", "legendgroup": "object", "showlegend": first, "hoverinfo": "skip"}
     points = thinned(panel.points)
     marks = {"mode": "markers", "marker": {"size": 1.8, "color": matplotlib.colors.to_hex(COLOURS(0.0))}}
-    meshed = panel.mesh is not None and len(panel.mesh.faces) <= MOST_TRIANGLES
-    if meshed:
-        vertices = np.asarray(panel.mesh.vertices, float)
-        i, j, k = np.asarray(panel.mesh.faces).T
+    mesh = panel.mesh if panel.mesh is not None and len(panel.mesh.faces) <= MOST_TRIANGLES else None
+    if mesh is not None:
+        vertices = np.asarray(mesh.vertices, float)
+        i, j, k = np.asarray(mesh.faces).T
         colour = matplotlib.colors.to_hex(tuple(polygons3d.SURFACE_COLOUR))
         lighting = {"ambient": 0.55, "diffuse": 0.7, "specular": 0.1}
         drawn.append(plotly.Mesh3d(**_axes(vertices), i=i, j=j, k=k, color=colour, lighting=lighting, **shares))
@@ -144,7 +144,7 @@ def _draw(plotly, drawn: list, moving: list[dict], name: str, panel: Side, box: 
     words = {"legendgroup": "box", "showlegend": first, "line": {"color": colour, "width": 6}}
     drawn.append(_line(plotly, start, name, "box of query points", **words))
     moving.append(_moving(drawn, edges, motion.rotations, motion.translations))
-    if meshed:  # what the network was given: a camera sees one side
+    if mesh is not None:  # what the network was given: a camera sees one side
         others = [one.name for one in drawn]
         shares |= {"name": CLOUD_NAME, "legendgroup": "cloud", "showlegend": CLOUD_NAME not in others}
         drawn.append(plotly.Scatter3d(**_axes(points), **marks, **shares, visible="legendonly"))
