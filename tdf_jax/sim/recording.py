@@ -18,7 +18,7 @@ from tdf_jax.sim.workcell import TABLE_NAME
 
 WIDTH, HEIGHT = 640, 480  # pixels
 RATE = 20.0  # pictures in a second of simulated time
-CENTRE, DISTANCE = (0.40, -0.02, 0.25), 1.85  # metres: arm and table fill the picture
+CENTRE, DISTANCE = (0.38, 0.0, 0.40), 2.35  # metres: the arm, the table and what is carried over it are in the picture
 AZIMUTH, ELEVATION, FOVY = 145.0, -27.0, 40.0  # degrees; the ground fills what is behind
 # What is drawn around the cell, and its light. The first light casts the shadows; the other fills them.
 GROUND = -0.72  # metres, height of the floor under the table

@@ -103,7 +103,7 @@ def _gif(images: list, rate: float) -> bytes:
     sheet = Image.new("RGB", (width, height * len(some)))
     for number, image in enumerate(some):
         sheet.paste(image, (0, number * height))
-    palette = sheet.quantize(COLOURS_OF_GIF, method=Image.Quantize.MEDIANCUT)
+    palette = sheet.quantize(COLOURS_OF_GIF, method=Image.Quantize.MAXCOVERAGE)
     first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
     ticks = np.diff(np.round(np.arange(len(images) + 1) * 100 / rate))  # a GIF counts hundredths of a second
     options = {"save_all": True, "append_images": others, "duration": (10 * ticks).astype(int).tolist(), "loop": 0}
