@@ -90,6 +90,21 @@ def test_a_page_shows_itself_in_a_cell_and_is_saved(demonstration, result, tmp_p
         tdf.plot.page(result)
 
 
+@pytest.mark.slow
+def test_a_page_plays_in_a_cell(demonstration, result, browser):
+    pytest.importorskip("plotly")
+    tab = browser.new_page(viewport={"width": 1000, "height": 700})
+    tab.context.set_offline(True)
+    tab.set_content(tdf.plot.page(tdf.ImitationScene(demonstration, CLOUD, result))._repr_html_())
+    frame = tab.frame_locator("iframe")
+    frame.locator("body[data-ready]").wait_for(timeout=60_000)
+    assert colours_of(tab.screenshot()) > 100
+    frame.get_by_role("button", name="Play").click()
+    last = 6 * (max(demonstration.trajectory.num_poses, len(result.trajectory.wxyz_xyz)) - 1)
+    frame.locator(f'body[data-frame="{last}"]').wait_for(timeout=60_000)
+    tab.close()
+
+
 @pytest.mark.parametrize("name", CALLS)
 def test_a_picture_is_a_figure_and_can_be_a_panel_of_another(name, demonstration, field, result, monkeypatch):
     if name == "reconstruction":

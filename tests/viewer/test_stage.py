@@ -270,3 +270,20 @@ def test_a_real_mouse_drags_the_object_in_a_browser_and_the_pick_changes(shown, 
     assert f"x {x:.1f}, y {y:.1f}, z {z:.1f} cm" in tab.inner_text("body")
     assert tab.screenshot() != before
     tab.close()
+
+
+@pytest.mark.slow
+def test_the_viewer_works_in_a_frame_of_another_page_such_as_a_cell(shown, browser):
+    IPython = pytest.importorskip("IPython.display", reason="the extra 'notebooks' is not installed")
+    cell = IPython.IFrame(address(shown.server), width="100%", height=600)  # as the guide to the viewer shows it
+    tab = browser.new_page(viewport={"width": 1000, "height": 700})
+    tab.set_content(f"<p>A notebook</p>{cell._repr_html_()}")
+    frame = tab.frame_locator("iframe")
+    frame.locator("canvas").last.wait_for(timeout=1000 * SECONDS)
+    frame.locator("text=Energy").first.wait_for(timeout=1000 * SECONDS)
+    tab.wait_for_timeout(3000)
+    assert colours_of(tab.screenshot()) > 300
+    frame.get_by_role("button", name="Play").click()
+    frame.get_by_role("button", name="Pause").wait_for(timeout=1000 * SECONDS)
+    shown.player.stop()
+    tab.close()
