@@ -292,6 +292,20 @@ def path_between(
     return np.concatenate([np.asarray(part).reshape(-1, 7) for part in parts])
 
 
+def contact_of(problem: Problem, solution: Solution) -> Float[np.ndarray, "7"] | None:
+    """Pose of the contact frame on the new target, T_world_contact, `wxyz_xyz`, (7,); None without a target.
+
+    Args:
+        problem: the problem.
+        solution: the pick and the path; the contact moves with its goal.
+    """
+    target = problem.scene.demonstration.target
+    if target is None or solution.to_target is None:
+        return None
+    motion = jnp.asarray(solution.to_target.target_motion, jnp.float32)
+    return np.asarray(se3.compose(motion, jnp.asarray(target.T_world_contact, jnp.float32)))
+
+
 def _to_target(problem: Problem, index: int) -> ToTarget:
     """How the object of a candidate arrives at its target."""
     scene, result, arrival = problem.scene, problem.scene.result, problem.arrival

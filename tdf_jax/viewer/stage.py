@@ -25,7 +25,7 @@ BESIDE, OVER, HIDDEN = "beside", "over it", "hidden"
 BOX, SURFACE, PROBE = COLOURS(0.35), ESTIMATE, MARKED
 REACH = 0.006  # metres from the ray of a click within which a point is hit
 SHOWN_MODES = 12
-SURFACE_NAME = "reconstructed surface"
+SURFACE_NAME, CONTACT_NAME = "reconstructed surface", "contact regions"
 PAINTING = 2.0  # seconds from a browser's connection to when it has painted
 GRIP = 0.5  # length of the arrows at the object, in its diagonal
 
@@ -95,6 +95,10 @@ class Stage:
             target = demonstration.target.points
         if target is not None:
             self._nodes["target"] = [handles.add_cloud(server, "/imitation/target", np.asarray(target), CLOUD)]
+        self._contact = None
+        if demonstration.target is not None and self.problem.placed:
+            self._contact = handles.add_box(server, "/imitation/contact", demonstration.target.query, TRUTH)
+            self._nodes[CONTACT_NAME] = [self._contact]
         self._draw_demonstration()
         # It is a place on the object, and moves with it.
         self._probe = handles.add_box(server, "/imitation/object/probe", demonstration.query, PROBE)
@@ -153,6 +157,10 @@ class Stage:
         if demonstration.target is not None:
             node = handles.add_cloud(server, "/demonstration/target", np.asarray(demonstration.target.points), CLOUD)
             self._nodes["target"].append(node)
+            if self._contact is not None:
+                box = handles.add_box(server, "/demonstration/contact", demonstration.target.query, TRUTH)
+                handles.place(box, *np.split(np.asarray(demonstration.target.T_world_contact, float), [4]))
+                self._nodes[CONTACT_NAME].append(box)
         points = np.asarray(demonstration.points, float)
         below = np.array([*points.mean(axis=0)[:2], points[:, 2].min() - 0.02])
         server.scene.add_label("/demonstration/name", "demonstration", position=below)
@@ -336,6 +344,9 @@ class Stage:
                 handles.place(node, pose[:4], pose[4:])
             if goal:
                 handles.place(self._goal, solution.goal[:4], solution.goal[4:])
+            contact = solving.contact_of(self.problem, solution)
+            if self._contact is not None and contact is not None:
+                handles.place(self._contact, contact[:4], contact[4:])
             self._summary.content = _words(solution)
             self._show_time()
 

@@ -122,6 +122,9 @@ def test_the_path_to_a_target_is_that_of_the_result(placed, number):
     assert len(found.path) > placed.scene.demonstration.trajectory.num_poses  # made denser
     path = solving.path_between(placed, found.pick, found.goal, found.to_target)
     np.testing.assert_allclose(path, found.path, atol=1e-4)
+    index = int(placed.modes[number].members[0])
+    contact = placed.scene.result.target_trajectories[index, 0]
+    np.testing.assert_allclose(solving.contact_of(placed, found), contact, atol=1e-5)
 
 
 def test_the_arrival_at_a_target_moves_with_the_goal(placed):
@@ -131,6 +134,8 @@ def test_the_arrival_at_a_target_moves_with_the_goal(placed):
     assert moved.path.shape == last.path.shape
     np.testing.assert_allclose(moved.path[-3:], last.path[-3:] + shift, atol=1e-4)
     np.testing.assert_allclose(moved.path[0], last.path[0], atol=1e-4)
+    contacts = [solving.contact_of(placed, one) for one in (moved, last)]
+    np.testing.assert_allclose(contacts[0], contacts[1] + shift, atol=1e-4)
     back = solving.with_goal(placed, last.goal, moved)
     np.testing.assert_allclose(back.path, last.path, atol=1e-4)
 

@@ -43,6 +43,10 @@ def test_what_is_placed_on_a_target_is_dragged_as_well(placed_scene, small_model
     with serving("test", 0) as server:
         shown = stage.Stage(server, problem)
         try:
+            regions = shown._nodes[stage.CONTACT_NAME]
+            poses = placed_scene.result.target_trajectories, placed_scene.demonstration.target.T_world_contact
+            best = poses[0][placed_scene.result.best, 0]
+            np.testing.assert_allclose([one.position for one in regions], [best[4:], poses[1][4:]], atol=1e-5)
             shown.prepare()
             assert shown.worker.wait(SECONDS)
             assert shown._status.content.startswith("Ready")
@@ -53,6 +57,8 @@ def test_what_is_placed_on_a_target_is_dragged_as_well(placed_scene, small_model
             assert "The path follows" in shown._status.content
             assert count == len(shown.solution.path) == len(shown._boxes) == shown.player.slider.max + 1
             np.testing.assert_allclose(shown._boxes[-1].position, shown.solution.path[-1, 4:], atol=1e-6)
+            contact = solving.contact_of(problem, shown.solution)
+            np.testing.assert_allclose(shown._contact.position, contact[4:], atol=1e-6)
         finally:
             shown.close()
 
