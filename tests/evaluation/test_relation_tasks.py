@@ -117,4 +117,4 @@ def test_parts_of_the_method_are_measured_at_the_truth(capsys):
     assert found.shape == (2,) and np.abs(found).max() < 0.003
     with pytest.raises(SystemExit):
         relation_study.main(["paths", "--pairs", "0"])
-    assert "--pairs is 0; expected at least 1" in capsys.readouterr().err
+    assert "--pairs: 0 is given; expected at least 1" in capsys.readouterr().err
