@@ -8,13 +8,12 @@ of which names it; everything else on the page is prose.
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 
-from tdf_jax.evaluation.statistics import bootstrap_interval
-from tdf_jax.evaluation.tables import between, markdown, percent
+from tdf_jax.evaluation.tables import between, markdown, percent, success_rate
 from tdf_jax.sim.report import PARTS, WORDS
 
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -51,12 +50,6 @@ def words(row: dict, *names: str) -> list[str]:
 def rate(found: dict) -> str:
     """A rate with its interval."""
     return percent(found["rate"]) + between(found["interval"])
-
-
-def rate_of(values: Sequence[bool]) -> str:
-    """A rate with its interval, of episodes that each have an object of their own."""
-    share = np.array(values, float)
-    return percent(float(share.mean())) + between(bootstrap_interval(share, range(len(share))))
 
 
 def rates(*records: str, beside: bool = True) -> str:
@@ -106,7 +99,7 @@ def other_methods() -> str:
                         *words(row, "task", "mode", "poses"),
                         f"**{name}**" if one is row else "the paper's energy" if name == "paper" else name,
                         str(len(episodes)),
-                        *(rate_of([episode[which] for episode in episodes]) for which in SUCCESS),
+                        *(success_rate([episode[which] for episode in episodes]) for which in SUCCESS),
                     ]
                 )
     return markdown(["task", "mode", "poses", "method", "episodes", *SUCCESS], cells)
@@ -181,9 +174,10 @@ def with_tables(page: str) -> str:
     for name, table in TABLES.items():
         begin, end = f"<!-- table: {name} -->", "<!-- end of table -->"
         pattern = re.compile(f"{re.escape(begin)}\n.*?{re.escape(end)}", re.DOTALL)
-        if len(pattern.findall(page)) != 1:
+        found = pattern.findall(page)
+        if len(found) != 1:
             raise SystemExit(f"{PAGE.name}: expected one table {name!r} between its comments")
-        page = pattern.sub(f"{begin}\n\n{table().strip()}\n\n{end}", page)
+        page = page.replace(found[0], f"{begin}\n\n{table().strip()}\n\n{end}")
     return page
 
 

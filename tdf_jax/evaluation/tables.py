@@ -2,6 +2,10 @@
 
 from collections.abc import Iterable, Sequence
 
+import numpy as np
+
+from tdf_jax.evaluation.statistics import bootstrap_interval
+
 
 def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A Markdown table.
@@ -49,6 +53,16 @@ def between(interval: Sequence[float] | None, factor: float = 100.0, digits: int
         return missing
     low, high = (factor * end for end in interval)
     return f" ({low:.{digits}f} to {high:.{digits}f})"
+
+
+def success_rate(successes: Sequence[bool]) -> str:
+    """A success rate with its 95 % bootstrap interval.
+
+    Args:
+        successes: whether each case succeeded, of an object of its own; at least one.
+    """
+    values = np.array(successes, float)
+    return percent(float(values.mean())) + between(bootstrap_interval(values, range(len(values))))
 
 
 def _line(cells: Sequence[str]) -> str:

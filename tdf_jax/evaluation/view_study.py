@@ -20,9 +20,9 @@ from scipy.spatial.transform import Rotation
 from tdf_jax._internal.files import replace_file
 from tdf_jax.energy.reference import Reference, describe
 from tdf_jax.evaluation.cases import QUERIES, QUERY_SIZE, SEED_SPACE
-from tdf_jax.evaluation.statistics import SUCCESS, bootstrap_interval
+from tdf_jax.evaluation.statistics import SUCCESS
 from tdf_jax.evaluation.study_command import file_to_write, study_parser
-from tdf_jax.evaluation.tables import between, percent
+from tdf_jax.evaluation.tables import success_rate
 from tdf_jax.geometry import se3
 from tdf_jax.geometry.demonstration import Demonstration
 from tdf_jax.geometry.query import box_query
@@ -178,8 +178,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         ("confidence below 0.5 with one view", [case.confident_before < 0.5 for case in cases]),
         ("handle seen by the second view", [case.seen >= SEEN for case in cases]),
     ):
-        share = np.array(values, float)
-        print(f"{words}: {percent(float(share.mean()))}{between(bootstrap_interval(share, range(len(share))))}")
+        print(f"{words}: {success_rate(values)}")
     if settings.out is not None:
         replace_file("view_study", settings.out, json.dumps([case._asdict() for case in cases], indent=1).encode())
 

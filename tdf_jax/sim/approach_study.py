@@ -12,9 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from tdf_jax._internal.errors import InputError
-from tdf_jax.evaluation.statistics import bootstrap_interval
 from tdf_jax.evaluation.study_command import study_parser
-from tdf_jax.evaluation.tables import between, markdown, percent
+from tdf_jax.evaluation.tables import markdown, success_rate
 from tdf_jax.shapes import FAMILIES, Shape
 from tdf_jax.sim.bodies import body_of
 from tdf_jax.sim.collision import TOUCHING
@@ -88,14 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             free.append(not reason)
             if reason:
                 print(f"{category} {number}: {reason}", file=sys.stderr, flush=True)
-        share = np.array(free, float)
-        rows.append(
-            [
-                category,
-                str(len(free)),
-                percent(float(share.mean())) + between(bootstrap_interval(share, range(len(free)))),
-            ]
-        )
+        rows.append([category, str(len(free)), success_rate(free)])
     print(markdown(["category", "objects", "approached without a collision"], rows))
 
 

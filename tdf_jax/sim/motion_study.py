@@ -18,9 +18,8 @@ import numpy as np
 
 from tdf_jax._internal.cache import digest, kept
 from tdf_jax._internal.errors import InputError
-from tdf_jax.evaluation.statistics import bootstrap_interval
 from tdf_jax.evaluation.study_command import study_parser
-from tdf_jax.evaluation.tables import between, markdown, percent
+from tdf_jax.evaluation.tables import markdown, success_rate
 from tdf_jax.sim.collision import Collisions
 from tdf_jax.sim.configurations import HALF_TURN
 from tdf_jax.sim.episode import start_cell
@@ -115,13 +114,12 @@ def table_of(rows: Sequence[Row]) -> str:
     keys = list(dict.fromkeys((row.task, row.poses) for row in rows))
     for key in [*keys, ("all", "")]:
         of = [row for row in rows if key in ((row.task, row.poses), ("all", ""))]
-        solved = np.array([row.solved for row in of], float)
         seconds = np.array([row.seconds for row in of])
         lines.append(
             [
                 " ".join(key).strip().replace("_", " "),
                 str(len(of)),
-                percent(float(solved.mean())) + between(bootstrap_interval(solved, range(len(of)))),
+                success_rate([row.solved for row in of]),
                 f"{np.median(seconds):.2f} s",
                 f"{np.percentile(seconds, 90):.2f} s",
             ]

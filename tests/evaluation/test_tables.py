@@ -7,7 +7,7 @@ import pytest
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation.records import SCHEMA, header, write_record
-from tdf_jax.evaluation.tables import aligned, between, markdown, percent
+from tdf_jax.evaluation.tables import aligned, between, markdown, percent, success_rate
 
 
 def test_markdown_has_a_line_for_the_heads_a_rule_and_a_line_for_each_row():
@@ -25,6 +25,11 @@ def test_words_are_aligned_left_and_numbers_right():
         "copy    10",
         "         5",
     ]
+
+
+def test_a_success_rate_has_its_interval_unless_there_is_one_case():
+    assert success_rate([True, False]) == "50 % (0 to 100)"
+    assert success_rate([True]) == "100 %"
 
 
 def test_shares_and_intervals_are_percentages():

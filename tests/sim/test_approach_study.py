@@ -21,17 +21,19 @@ def test_the_open_hand_passes_a_wall_and_fingers_that_hardly_open_hit_it(robot, 
     assert approach_depth(bowl(), robot) > TOUCHING
 
 
-def test_the_hand_does_not_pass_through_the_table(robot, monkeypatch):
+@pytest.mark.parametrize(("down", "passes"), [(0.0, True), (0.2, False)])
+def test_the_hand_does_not_pass_through_the_table(robot, monkeypatch, down, passes):
+    """Beside the object, where it meets nothing else."""
     grip_of = approach_study.grip_of
 
-    def deeper(*words):
+    def aside(*words):
         grip = grip_of(*words)
         T = grip.T_object_grip.copy()
-        T[2, 3] -= 0.2
+        T[:3, 3] += (0.4, 0, -down)
         return grip._replace(T_object_grip=T)
 
-    monkeypatch.setattr(approach_study, "grip_of", deeper)
-    assert approach_depth(bowl(), robot) > 0.01
+    monkeypatch.setattr(approach_study, "grip_of", aside)
+    assert (approach_depth(bowl(), robot) <= TOUCHING) is passes
 
 
 def test_an_object_without_a_grasp_counts_as_one_that_is_not_approached(robot, monkeypatch, capsys):

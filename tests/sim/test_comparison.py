@@ -91,6 +91,7 @@ def test_only_teleported_objects_are_light():
     ("changes", "message"),
     [
         ({"clouds": ()}, "--clouds is empty; expected at least one"),
+        ({"tasks": ("bowl_on_shelf",), "targets": ("found",)}, "--targets has 'found', for which there is no row"),
         ({"masks": ("simulator",)}, "--masks has 'simulator', for which there is no row"),
         ({"targets": ()}, "--targets is empty; expected at least one"),
         ({"tasks": ("bowl_on_shelf",), "targets": ("known", "found")}, "--targets has 'found', for which there is no"),
