@@ -54,6 +54,12 @@ def test_links_lead_to_files_and_headings(page):
             assert anchor in anchors(target), f"{link}: no such heading"
 
 
+def test_templates_of_issues_have_no_links_into_the_repository():
+    """An issue is another page of the web than the file, so a relative link leads nowhere."""
+    templates = [text(page) for page in (ROOT / ".github" / "ISSUE_TEMPLATE").iterdir()]
+    assert templates and [link for one in templates for link in LINK.findall(one) if "://" not in link] == []
+
+
 def test_every_picture_and_page_is_linked():
     linked = {
         (page.parent / link.partition("#")[0]).resolve()
@@ -145,3 +151,10 @@ def test_the_version_is_the_same_everywhere():
     for name, pattern in found.items():
         first = re.search(pattern, (ROOT / name).read_text(), re.MULTILINE)
         assert first and first[1] == tdf_jax.__version__, name
+
+
+@pytest.mark.parametrize("page", sorted((ROOT / "docs" / "results").glob("*.md")), ids=lambda page: page.stem)
+def test_every_page_of_results_says_what_it_does_not_show(page):
+    """Pages of notes too: what they are no evidence for is said there as well."""
+    (said,) = re.findall(r"^## What this does not show\n+(.*?)(?=^## |\Z)", text(page), re.MULTILINE | re.DOTALL)
+    assert len(said.split()) > 20
