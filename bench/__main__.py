@@ -72,7 +72,7 @@ def _options(arguments):
 
 def _run(options):
     if importlib.util.find_spec("torch") is None:
-        raise InputError("bench: PyTorch is not installed; expected the extra: pip install -e '.[bench]'")
+        raise InputError("bench: PyTorch is not installed; expected the extra: pip install 'tdf_jax[bench]'")
     if options.repetitions < 1:
         raise InputError(f"bench: --repetitions is {options.repetitions}; expected at least 1")
     if options.scaling and options.out is None:

@@ -6,10 +6,12 @@ are not run: they install from the package index, or need a program that is no p
 """
 
 import ast
+import builtins
 import functools
 import importlib
 import re
 import shlex
+import symtable
 import sys
 from pathlib import Path
 
@@ -57,6 +59,35 @@ def test_every_page_with_python_is_run():
     with_python = {str(page.relative_to(ROOT)) for page in PAGES if blocks(page, "python")}
     here = {f"docs/{name}" for name in re.findall(r'run\("([\w/]+\.md)"', Path(__file__).read_text())}
     assert with_python == here | {"README.md", "docs/quickstart.md", "docs/guide/camera.md"}
+
+
+def names(statement: ast.stmt) -> tuple[set[str], set[str]]:
+    """Names that a statement at the top of a block reads from before it, and those that it defines."""
+    top = symtable.symtable(ast.unparse(statement), "block", "exec")
+    symbols, nested = top.get_symbols(), list(top.get_children())
+    defined = {one.get_name() for one in symbols if one.is_assigned() or one.is_imported()}
+    read = {one.get_name() for one in symbols if one.is_referenced()}
+    if not isinstance(statement, ast.Assign):  # x = f(x) reads an earlier x; the variable of a loop is its own
+        read -= defined
+    for table in nested:
+        read |= {one.get_name() for one in table.get_symbols() if one.is_global()}
+        nested += table.get_children()
+    return read - set(dir(builtins)), defined
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.stem)
+def test_pages_say_where_the_names_of_their_blocks_come_from(page):
+    """A name is of the block, of an earlier one, which the page then says, or the words before it have the name."""
+    known, before = set(), ""
+    for prose, block in re.findall(r"(.*?)```python\n(.*?)```", page.read_text(), re.DOTALL):
+        before += prose
+        earlier = set(known)
+        for statement in ast.parse(block).body:
+            read, defined = names(statement)
+            unsaid = {name for name in read - known if not re.search(rf"`{name}\b", before)}
+            assert not unsaid, f"{page.name} does not say what these are: {sorted(unsaid)}"
+            assert not read & earlier or "continue" in before, f"{page.name} does not say what {block[:60]!r} continues"
+            known |= defined
 
 
 def test_the_quick_start_is_the_readme():
@@ -168,7 +199,7 @@ def test_devices_and_batches(run, assumed, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["imitate.py", "1"])
     clouds = jnp.asarray(np.stack([random_cloud(seed) for seed in (3, 4)]), jnp.float32)
     reference = tdf.describe(assumed["model"], assumed["demo"])
-    names = run("guide/scaling.md", assumed | {"sys": sys, "clouds": clouds, "reference": reference})
+    names = run("guide/scaling.md", assumed | {"clouds": clouds, "reference": reference})
     assert names["result"].initial_trajectories.shape[0] == 512
     assert joined == [(("first-machine:7777",), {"num_processes": 2, "process_id": 1})]
     assert len(names["picks"]) == 2 and all(pick.shape == (7,) for pick in names["picks"])

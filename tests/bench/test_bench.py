@@ -175,7 +175,7 @@ def test_mistakes_are_one_line_and_exit_code_2(capsys, monkeypatch, words, messa
 def test_without_torch_the_extra_is_named(capsys, monkeypatch):
     monkeypatch.setattr(command_line.importlib.util, "find_spec", lambda name: None)
     assert command_line.main([]) == 2
-    assert "pip install -e '.[bench]'" in capsys.readouterr().err
+    assert "pip install 'tdf_jax[bench]'" in capsys.readouterr().err
 
 
 def test_full_sizes_have_the_rows_and_their_operations():
