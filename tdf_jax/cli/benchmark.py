@@ -101,7 +101,7 @@ def benchmark(
         processes: number of processes of --simulation, on which the outcomes do not depend.
         page: write pages of failures, to turn and play in a browser without a network, in the folder runs/failures:
             those that benchmark.md lists, or the first of each cause of --simulation; needs the extra "pages".
-        playbacks: keep the motion of every episode of --simulation in the folder runs/episodes, 80 kB each, which
+        playbacks: keep the motion of every episode of --simulation in the folder runs/episodes, 0.1 MB each, which
             `tdf view` and --page play.
         object_weights: weights of the object of --relations.
         target_weights: weights of the target of --relations.

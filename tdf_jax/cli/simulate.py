@@ -76,7 +76,7 @@ def simulate(
         animation: film of the first episode, a .gif or .mp4 file; only of executed ones.
         page: write episode.html, the first episode to turn and play in a browser without a network, and such a page of
             the first failure of each cause in the folder failures; needs the extra "pages".
-        playbacks: keep the motion of every episode in the folder episodes of --out, 80 kB each, which `tdf view` and
+        playbacks: keep the motion of every episode in the folder episodes of --out, 0.1 MB each, which `tdf view` and
             --page play.
         json: file for all outcomes.
         out: folder that keeps the outcomes between runs.
