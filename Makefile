@@ -39,13 +39,13 @@ $(VENV)/.venv:
 	$(PYTHON) -m venv $(VENV)
 	touch $@
 
-# installed again where the version changes, which is in the __init__.py of the package
-$(VENV)/.installed: $(VENV)/.venv pyproject.toml tdf_jax/__init__.py
+# installed again where the version changes
+$(VENV)/.installed: $(VENV)/.venv pyproject.toml tdf_jax/_internal/version.py
 	$(BIN)/pip install --quiet --editable .
 	touch $@
 
 # .installed-NAME: with the extra NAME
-$(VENV)/.installed-%: $(VENV)/.venv pyproject.toml tdf_jax/__init__.py
+$(VENV)/.installed-%: $(VENV)/.venv pyproject.toml tdf_jax/_internal/version.py
 	$(BIN)/pip install --quiet --editable '.[$*]'
 	touch $(VENV)/.installed $@
 

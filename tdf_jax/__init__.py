@@ -22,6 +22,7 @@ from tdf_jax._internal.errors import (
     SizeWarning as SizeWarning,
     TdfWarning as TdfWarning,
 )
+from tdf_jax._internal.version import __version__ as __version__
 from tdf_jax.energy.descriptors import (
     pose_descriptor as pose_descriptor,
     trajectory_descriptor as trajectory_descriptor,
@@ -148,8 +149,6 @@ from tdf_jax.uncertainty.calibration import (
 )
 from tdf_jax.uncertainty.covariance import pose_covariance as pose_covariance
 from tdf_jax.uncertainty.modes import cluster_poses as cluster_poses
-
-__version__ = "0.2.0"
 
 __all__ = [
     "available_models",

@@ -30,7 +30,7 @@ from tdf_jax.solvers.multistart import SolveConfig, solve
 from tdf_jax.solvers.pick import CarryConfig, carry, carry_together
 from tdf_jax.solvers.result import Result
 from tdf_jax.uncertainty.advice import look_from, points_at
-from tdf_jax.uncertainty.calibration import CALIBRATED, CURVES, confidence, recognition, surface_logit
+from tdf_jax.uncertainty.calibration import CURVES, confidence_by, recognition, surface_logit
 from tdf_jax.uncertainty.doubt import DOUBT, warn_of_category, warn_of_target
 
 # Objects whose picks an accelerator finds together. It is an estimate, as `devices.ACCELERATOR_POINTS` is: the first
@@ -175,11 +175,9 @@ def _merged(points) -> Any:
 
 def _judged(result: Result, weights: str, field, points, reference: Reference) -> Result:
     """The result with the probabilities that shipped weights are calibrated for, NaN where they are not, and advice."""
-    recognised = confident = None
+    recognised, confident = None, confidence_by(weights, float(result.residual))
     if weights in CURVES:
         recognised = recognition(float(result.residual), surface_logit(field, points), CURVES[weights])
-    if weights in CALIBRATED:
-        confident = confidence(float(result.residual))
     if confident is not None:
         result = dataclasses.replace(
             result, points_at_pick=np.asarray(points_at(points, result.pick, reference.query), np.int32)

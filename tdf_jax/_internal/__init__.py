@@ -11,5 +11,6 @@ Modules:
     files: atomic writes
     precision: full float32 products on every device
     units: units of length
+    version: the version of the library
     workers: processes that end with the run
 """

@@ -189,9 +189,9 @@ def benchmark(
     ]
     scores, scenes = [], {}
     for task, method, attempt in run(makers, model, names, folder, seed=seed, num_starts=num_starts):
-        scores.append(score(method, attempt, task))
+        scores.append(score(method, attempt, task, model.info.name))
         if page and failures(scores[-1:]):
-            scenes[page_name(scores[-1])] = failure_scene(task, attempt)
+            scenes[page_name(scores[-1])] = failure_scene(task, attempt, model.info.name)
             listed = [page_name(one) for one in failures(scores)[:LISTED]]
             scenes = {name: scene for name, scene in scenes.items() if name in listed}  # a scan may be large
     if not scores:

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
 from pathlib import Path
 
 import jax
@@ -12,6 +11,7 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from tdf_jax._internal.cache import kept
+from tdf_jax._internal.version import __version__
 from tdf_jax.energy.reference import COMBINATIONS, Reference, describe
 from tdf_jax.evaluation.cases import mug_of
 from tdf_jax.evaluation.metrics import pose_error
@@ -71,7 +71,7 @@ def count_errors(
     """
     groups: dict[tuple, list] = {}
     counts = tuple(dict.fromkeys(counts))
-    about = [FORMAT, version("tdf_jax"), jax.default_backend(), fingerprint(model), seed]
+    about = [FORMAT, __version__, jax.default_backend(), fingerprint(model), seed]
     for make in tqdm(makers if counts else (), desc="demonstrations", unit="task", disable=not (progress and counts)):
         task = make()
         if task.index % EVERY:

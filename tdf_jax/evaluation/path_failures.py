@@ -14,7 +14,7 @@ from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.solvers.imitation_scene import ImitationScene
 from tdf_jax.solvers.result import Result
 from tdf_jax.uncertainty.advice import points_at
-from tdf_jax.uncertainty.calibration import confidence
+from tdf_jax.uncertainty.calibration import confidence_by
 
 
 def failures(scores: Sequence[Score]) -> list[Score]:
@@ -48,14 +48,15 @@ def page_title(score: Score) -> str:
     )
 
 
-def failure_scene(task: Task, attempt: Attempt) -> ImitationScene:
+def failure_scene(task: Task, attempt: Attempt, weights: str) -> ImitationScene:
     """An attempt as a scene that pictures show, with the ground truth and the meshes of both objects.
 
     Args:
         task: the task.
         attempt: the attempt of a method on it.
+        weights: name of the network's weights, which decides whether a confidence is known.
     """
-    case, known = task.case, confidence(attempt.residual)
+    case, known = task.case, confidence_by(weights, attempt.residual)
     result = Result(
         trajectories=attempt.trajectories,
         energies=attempt.scores,

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 
 import jax
@@ -11,13 +10,14 @@ from tqdm.auto import tqdm
 
 from tdf_jax._internal.cache import kept
 from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.version import __version__
 from tdf_jax.evaluation.metrics import FLIP_DEGREES, frechet_distance, jerk, longest_step, penetration, pose_error
 from tdf_jax.evaluation.path_methods import METHODS, Attempt, Attempts, tried
 from tdf_jax.evaluation.path_tasks import Task
 from tdf_jax.evaluation.statistics import FINE, THRESHOLDS, Threshold, bootstrap_interval, percentiles, success_rates
 from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.networks.model import Model, fingerprint
-from tdf_jax.uncertainty.calibration import confidence
+from tdf_jax.uncertainty.calibration import confidence_by
 
 FORMAT = 2  # format number; raise it when the computation of an attempt changes
 LEAST_JERK = 1e-4  # smallest denominator of a ratio of jerks, metres
@@ -54,7 +54,7 @@ def run(
     for method in methods:
         if method not in METHODS:
             raise InputError(f"run(): methods has {method!r}; expected some of {', '.join(METHODS)}")
-    about = [FORMAT, version("tdf_jax"), jax.default_backend(), fingerprint(model), seed, num_starts]
+    about = [FORMAT, __version__, jax.default_backend(), fingerprint(model), seed, num_starts]
     key = jax.random.key(seed)
     for make in tqdm(makers, desc="benchmark", unit="task", disable=not progress):
         task = make()
@@ -96,7 +96,7 @@ class Score:
             no inside.
         starts: number of starts.
         seconds: time of the attempt.
-        confidence: probability that the pick is right; None where the method gives none.
+        confidence: probability that the pick is right; None where the method or the weights have none.
     """
 
     method: str
@@ -132,13 +132,14 @@ class Score:
         return float(np.mean(self.distances[:-1]))
 
 
-def score(method: str, attempt: Attempt, task: Task) -> Score:
+def score(method: str, attempt: Attempt, task: Task, weights: str) -> Score:
     """Measure an attempt against the ground truth of its task.
 
     Args:
         method: name of the method.
         attempt: its trajectories.
         task: the task.
+        weights: name of the network's weights.
     """
     # A start that is not finite counts as the unchanged demonstration. It is not selected while another is finite.
     demonstrated = np.asarray(task.demonstration.trajectory.wxyz_xyz)
@@ -170,7 +171,7 @@ def score(method: str, attempt: Attempt, task: Task) -> Score:
         penetration=None if inside is None or inside_truth is None else inside - inside_truth,
         starts=len(attempt.scores),
         seconds=attempt.seconds,
-        confidence=confidence(attempt.residual),
+        confidence=confidence_by(weights, attempt.residual),
     )
 
 

@@ -2,13 +2,13 @@
 
 import json
 from collections.abc import Mapping
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import jax
 
 from tdf_jax._internal.files import replace_file
+from tdf_jax._internal.version import __version__
 from tdf_jax.networks.model import Model
 
 # Raised when a key changes its name or its meaning. `tdf evaluate` wrote 2 and `tdf benchmark` 1 before they shared it.
@@ -27,7 +27,7 @@ def header(settings: Mapping[str, Any], model: Model) -> dict[str, Any]:
     """
     return {
         "schema": SCHEMA,
-        "tdf_jax": version("tdf_jax"),
+        "tdf_jax": __version__,
         "settings": dict(settings),
         "weights": {"name": model.info.name, "source": model.info.source},
         "machine": {"jax": jax.__version__, "backend": jax.default_backend()},

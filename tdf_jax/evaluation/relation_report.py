@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from tdf_jax._internal.version import __version__
 from tdf_jax.evaluation.records import SCHEMA
 from tdf_jax.evaluation.relation_scores import LIBRARY, Condition, Networks, Score, success
 from tdf_jax.evaluation.relation_success import FREED_BY, TOLERANCES, UPRIGHT, Placed
@@ -74,11 +75,9 @@ def record(
         settings: settings of the command.
         redrawn: number of pairs of each task that were drawn and cannot fit by construction.
     """
-    from importlib.metadata import version
-
     return {
         "schema": SCHEMA,
-        "tdf_jax": version("tdf_jax"),
+        "tdf_jax": __version__,
         "settings": dict(settings),
         "weights": {task: [model.info.name for model in pair] for task, pair in networks.items()},
         "redrawn": dict(redrawn),

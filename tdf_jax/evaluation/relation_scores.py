@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +15,7 @@ from tqdm.auto import tqdm
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.cache import kept
+from tdf_jax._internal.version import __version__
 from tdf_jax.energy.reference import Reference, describe
 from tdf_jax.evaluation.baselines import iterative_closest_points
 from tdf_jax.evaluation.relation_success import Placed, judge
@@ -126,7 +126,7 @@ def run(
             for method in methods:
                 if shown < 0 and method not in (LIBRARY, UNSEATED):
                     continue  # a baseline has one demonstration
-                about = [FORMAT, version("tdf_jax"), jax.default_backend(), *names, *condition, number, shown, seed]
+                about = [FORMAT, __version__, jax.default_backend(), *names, *condition, number, shown, seed]
                 result = kept("tdf benchmark", folder, [*about, method], functools.partial(attempts.of, method))
                 verdict = Placed(**{field.name: result[field.name].item() for field in dataclasses.fields(Placed)})
                 motion = np.asarray(result["motion"], float)

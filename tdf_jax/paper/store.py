@@ -3,11 +3,11 @@
 import dataclasses
 import json
 from collections.abc import Callable
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from tdf_jax._internal.cache import kept
+from tdf_jax._internal.version import __version__
 from tdf_jax.networks.model import Model, fingerprint
 from tdf_jax.paper.energy_maps import Swept, figure2
 from tdf_jax.paper.runs import Run, imitation
@@ -28,7 +28,7 @@ class Store:
     def __init__(self, model: Model, directory: Path):
         self.model, self.directory = model, directory
         # These values are in every digest, so that a folder never mixes results of different versions.
-        self._about = [FORMAT, version("tdf_jax"), fingerprint(model)]
+        self._about = [FORMAT, __version__, fingerprint(model)]
 
     def run(self, setting: Setting) -> Run:
         """Load or compute the run of a setting."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tdf_jax._internal.version import __version__
 from tdf_jax.evaluation.tables import between, markdown, percent
 from tdf_jax.sim import report
 from tdf_jax.sim.condition import GENERATED, LIBRARY, MESHES, SEGMENTED
@@ -42,7 +43,7 @@ def record(rows: Sequence[Row], settings: Mapping[str, Any]) -> dict[str, Any]:
         made.append(one)
     return {
         "schema": SCHEMA,
-        "tdf_jax": version("tdf_jax"),
+        "tdf_jax": __version__,
         "settings": dict(settings),
         "rows": made,
         "machine": machine(),

@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import time
 from collections.abc import Sequence
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -12,6 +11,7 @@ from jaxtyping import Float
 
 from tdf_jax._internal.cache import digest, kept
 from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.version import __version__
 from tdf_jax.sim.condition import (
     DEMONSTRATIONS,
     EVEN,
@@ -218,7 +218,7 @@ class Imitator:
         """
         scan = self.scan(number)
         return [
-            *(FORMAT, version("tdf_jax"), *self.fingerprints, *self.robot_content),
+            *(FORMAT, __version__, *self.fingerprints, *self.robot_content),
             *(self.settings.seed, number, None if scan is None else [scan.name, scan.digest]),
         ]
 

@@ -4,12 +4,12 @@ import collections
 import dataclasses
 import re
 from collections.abc import Sequence
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from tdf_jax._internal.version import __version__
 from tdf_jax.evaluation.statistics import bootstrap_interval
 from tdf_jax.evaluation.tables import percent
 from tdf_jax.sim.campaign import Run
@@ -181,7 +181,7 @@ def record(settings: Settings, runs: Sequence[Run]) -> dict[str, Any]:
     parts = seconds(runs)
     return {
         "schema": SCHEMA,
-        "tdf_jax": version("tdf_jax"),
+        "tdf_jax": __version__,
         "condition": settings.condition._asdict(),
         "seed": settings.seed,
         "weights": {"object": settings.object_weights, "target": settings.target_weights},

@@ -68,6 +68,19 @@ def confidence(residual: float, intercept: float = INTERCEPT, slope: float = SLO
     return min(MAX_CONFIDENCE, float(1 / (1 + np.exp(slope * np.log(max(residual, 1e-9)) - intercept))))
 
 
+def confidence_by(weights: str, residual: float) -> float | None:
+    """Confidence of a pick where the curve is calibrated for the weights.
+
+    Args:
+        weights: name of the weights, `model.info.name`.
+        residual: residual of the pick, without a unit.
+
+    Returns:
+        The probability, in [0, 0.99]; None if there is no curve for the weights or the residual is not finite.
+    """
+    return confidence(residual) if weights in CALIBRATED else None
+
+
 def bins(predicted: Float[np.ndarray, " picks"], right: Float[np.ndarray, " picks"]) -> list[dict]:
     """Reliability of confidences: how many picks are right in each bin of `EDGES`.
 

@@ -1,6 +1,7 @@
 """The benchmark: tasks, methods, scores, reliability, what is kept, several demonstrations, the page."""
 
 import dataclasses
+import functools
 import json
 import re
 from types import SimpleNamespace
@@ -27,7 +28,7 @@ from tdf_jax.evaluation.metrics import pose_error
 from tdf_jax.evaluation.path_failures import failure_scene, failures, page_name, page_title
 from tdf_jax.evaluation.path_methods import METHODS, Attempt, Attempts
 from tdf_jax.evaluation.path_report import LISTED, page, record, sections
-from tdf_jax.evaluation.path_scores import Score, by_method, run, score, summary
+from tdf_jax.evaluation.path_scores import Score, by_method, run, score as score_by, summary
 from tdf_jax.evaluation.path_tasks import DISPLACEMENTS, carried_by, make_task, mesh_index
 from tdf_jax.evaluation.statistics import SUCCESS, THRESHOLDS, Threshold, bootstrap_interval
 from tdf_jax.evaluation.tables import markdown
@@ -65,6 +66,9 @@ def task(case, few_query_points):
 def model(small_model):
     """Every cloud is thinned to 40 points: to compile once."""
     return dataclasses.replace(small_model, info=ModelInfo("small", "a test", cloud_points=40))
+
+
+score = functools.partial(score_by, weights="mug")
 
 
 def shown_in(task):
@@ -1338,18 +1342,26 @@ def test_listed_failures_link_to_their_pages(many, model, text):
 
 def test_a_failure_is_shown_with_its_candidates_and_the_ground_truth(task):
     trajectories = np.stack([np.asarray(task.expected.shifted(np.full(3, shift)).wxyz_xyz) for shift in (0.1, 0.3)])
-    scene = failure_scene(task, Attempt(trajectories, np.array([2.0, 1.0]), 0.5, residual=0.6))
+    attempt = Attempt(trajectories, np.array([2.0, 1.0]), 0.5, residual=0.6)
+    scene = failure_scene(task, attempt, "mug")
     np.testing.assert_allclose(scene.result.trajectory.wxyz_xyz, trajectories[1])
     np.testing.assert_allclose(scene.expected.wxyz_xyz, task.expected.wxyz_xyz)
     assert (
         scene.result.confidence == pytest.approx(calibration.confidence(0.6))
         and scene.demonstration is task.demonstration
     )
+    assert np.isnan(failure_scene(task, attempt, "bowl").result.confidence)
     np.testing.assert_array_equal(scene.points, task.case.points_b)
     first, second = (np.asarray(mesh.vertices) for mesh in scene.meshes)
     np.testing.assert_allclose(first, task.case.object_a.mesh.vertices)
     T = task.case.T_world_b
     np.testing.assert_allclose(second, np.asarray(task.case.object_b.mesh.vertices) @ T[:3, :3].T + T[:3, 3])
+
+
+def test_a_confidence_is_of_calibrated_weights_only(task):
+    attempt = Attempt(perfect(task), np.zeros(1), 1.5, 0.6)
+    assert score_by("tdf_jax", attempt, task, "mug").confidence == calibration.confidence(0.6)
+    assert score_by("tdf_jax", attempt, task, "bowl").confidence is None
 
 
 def test_the_one_pick_that_failed_is_listed(model):
