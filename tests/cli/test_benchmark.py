@@ -1,5 +1,6 @@
 """`tdf benchmark` and its pictures."""
 
+import dataclasses
 import json
 import re
 import shlex
@@ -10,7 +11,7 @@ import matplotlib
 import matplotlib.figure
 import numpy as np
 import pytest
-from conftest import page_content
+from conftest import POINTS, page_content
 
 from tdf_jax.cli.benchmark import Cloud
 from tdf_jax.cli.main import main
@@ -18,6 +19,8 @@ from tdf_jax.evaluation.cases import mug_case
 from tdf_jax.evaluation.conditions import CONDITIONS
 from tdf_jax.evaluation.path_scores import Score, by_method
 from tdf_jax.evaluation.path_tasks import make_task, mesh_index
+from tdf_jax.networks.checkpoint import save_model
+from tdf_jax.networks.model import ModelInfo
 from tdf_jax.shapes import build_mug
 from tdf_jax.uncertainty.calibration import bins
 from tdf_jax.viz.evaluation import demonstrations_figure, errors_figure, reliability_figure, truth_figure
@@ -58,6 +61,19 @@ def told(folder):
 
 METHODS = ("copy", "centroids", "tdf_jax")
 PLAIN = ("--pairs", 2, "--methods", *METHODS)
+
+
+def named(model, name, folder):
+    """A file of a network under another name."""
+    path = folder / f"{name}.safetensors"
+    save_model(dataclasses.replace(model, info=ModelInfo(name, "a test", cloud_points=POINTS)), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def weights(small_model, tmp_path_factory):
+    """A small network under the name of weights that have a curve of the confidence."""
+    return named(small_model, "mug", tmp_path_factory.mktemp("weights"))
 
 
 @pytest.fixture(scope="module")
@@ -118,8 +134,16 @@ def test_the_record_has_every_task_by_every_method_and_the_settings(folder, weig
         | {"pairs": 2, "seed": 0, "height": 0.12, "clouds": ["full"], "weights": str(weights), "demonstrations": []}
         == record["settings"]
     )
-    assert record["weights"] == {"name": "small", "source": "a test"} and "demonstrations" not in record
+    assert record["weights"] == {"name": "mug", "source": "a test"} and "demonstrations" not in record
     assert record["reliability"]["picks"] == 2
+
+
+def test_other_weights_have_no_confidence(small_model, tmp_path):
+    other = named(small_model, "bowl", tmp_path)
+    run("--weights", other, "--pairs", 1, "--methods", "tdf_jax", "--out", tmp_path / "out")
+    record = read(tmp_path / "out")
+    assert [one["confidence"] for one in record["tasks"]] == [None]
+    assert "reliability" not in record and not (tmp_path / "out" / "reliability.png").exists()
 
 
 def test_errors_of_a_copy_are_those_by_hand(folder):
