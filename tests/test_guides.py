@@ -9,8 +9,10 @@ import ast
 import builtins
 import functools
 import importlib
+import json
 import re
 import shlex
+import shutil
 import symtable
 import sys
 from pathlib import Path
@@ -125,7 +127,7 @@ COMMAND_LINES = [
 
 @pytest.mark.parametrize("page, line", COMMAND_LINES, ids=[f"{page.stem}: {line}" for page, line in COMMAND_LINES])
 def test_command_lines_are_understood(page, line, monkeypatch):
-    """Every option and value is accepted; the commands themselves are run by their own tests."""
+    """Every option and value is accepted; `RUN` has the lines that are run, and why the others are not."""
     seen = []
     for name in COMMANDS:
         module = importlib.import_module(f"tdf_jax.cli.{name}")
@@ -134,6 +136,86 @@ def test_command_lines_are_understood(page, line, monkeypatch):
     words = shlex.split(line)
     main(["--no-cache", *words[1:]])
     assert seen == [words[1]]
+
+
+# Lines that the test below runs, by page, with the fewest starts, query points and sampled points. The other lines are
+# understood only: each takes minutes with any settings (evaluate, benchmark, simulate, dataset, train, reproduce), or
+# waits for a user (view), needs a robot's file of another project (simulate --robot) or weights of such a run, or is one
+# of these lines with another seed or file.
+SMALL = ("--num-starts", "2", "--points", "200", "--no-plots")
+RUN = {
+    "installation": ("tdf imitate", "tdf env"),
+    "quickstart": (
+        "tdf imitate --target my_mug.obj --scale 0.01",
+        "tdf imitate --category bowl --out bowl",
+        "tdf imitate --task bowl_on_mug --out placed",
+    ),
+    "guide/camera": (
+        "tdf imitate --depth docs/guide/camera/depth.png --depth-scale 0.001 "
+        "--intrinsics docs/guide/camera/intrinsics.txt --camera-pose docs/guide/camera/T_world_camera.txt "
+        "--workspace 0.2 -0.4 -0.05 0.8 0.4 0.5 --clusters",
+    ),
+    "guide/demonstrations": (
+        "tdf demonstrate --points cloud.ply --trajectory path.tum --query-box 0.06 --grasp 12 --release 80 "
+        "--out demo.npz",
+        "tdf imitate --demonstration demo.npz --target new_mug.ply --out result",
+    ),
+    "guide/objects": ("tdf imitate --target my_scan.ply --drop-invalid --demonstration demo.npz --out result",),
+    "guide/targets": (
+        "tdf demonstrate --points bowl.ply --trajectory path.tum --query-box 0.06 --target-object mug.ply "
+        "--out demo.npz",
+        "tdf imitate --weights bowl --demonstration demo.npz --target new_bowl.ply --target-object new_mug.ply "
+        "--target-weights mug",
+        "tdf imitate --task bowl_on_mug --target known",
+    ),
+    "guide/viewer": ("tdf imitate --seed 500 --page --out imitation",),
+}
+
+
+@pytest.fixture
+def recordings(tmp_path, monkeypatch):
+    """An empty folder with the files that the guides name: clouds, a mesh in centimetres, a path from the rim."""
+    monkeypatch.chdir(tmp_path)
+    mugs = tdf.build_mug(), tdf.build_mug(tdf.MugParameters(height=0.09, handle_style="ring", handle_top=0.075))
+    bowls = tdf.build_bowl(), tdf.build_bowl(tdf.sample_bowl(np.random.default_rng(4)))
+    scaled = mugs[1].mesh.copy()
+    scaled.apply_scale(100)
+    scaled.export("my_mug.obj")
+    clouds = {name: tdf.sample_surface(one.mesh, 400, 0) for name, one in zip(("mug", "new_mug"), mugs)}
+    clouds |= {name: tdf.sample_surface(one.mesh, 400, 0) for name, one in zip(("bowl", "new_bowl"), bowls)}
+    handle, rim = mugs[0].handle_frame[:3, 3], bowls[0].frames["rim"][:3, 3]
+    # the bowl is put on the mug: its foot, the lowest points, comes to the rim
+    above = mugs[0].mesh.bounds[1, 2] - bowls[0].mesh.bounds[0, 2]
+    paths = {"handle": tdf.line(100, handle, handle + [0, 0.3, 0.1]), "rim": tdf.line(100, rim, rim + [0, 0.3, above])}
+    clouds["mug"] = clouds["mug"] + [0, 0.3, 0]
+    clouds |= {"cloud": tdf.sample_surface(mugs[0].mesh, 400, 0)}
+    clouds |= {"my_scan": np.concatenate([clouds["new_mug"], np.full((3, 3), np.nan)])}
+    for name, cloud in clouds.items():
+        save_cloud(tmp_path / f"{name}.ply", cloud)
+    return paths
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", RUN)
+def test_cheap_command_lines_run(page, recordings, tmp_path):
+    lines = RUN[page]
+    assert set(lines) <= {" ".join(line.split()) for path, line in COMMAND_LINES if path == DOCS / f"{page}.md"}
+    tdf.save_trajectory("path.tum", recordings["rim" if page == "guide/targets" else "handle"])
+    if page == "guide/camera":
+        shutil.copytree(DOCS / "guide" / "camera", tmp_path / "docs" / "guide" / "camera")
+    if page == "guide/objects":
+        query = tdf.box_query(jax.random.key(1), 16, size=0.06)
+        shown = tdf.load_points("cloud.ply")
+        tdf.save_demonstration("demo.npz", tdf.Demonstration(shown, tdf.resample(recordings["handle"], 5), query))
+    for line in lines:
+        words = shlex.split(line)[1:]
+        generated = words[0] == "imitate" and not {"--demonstration", "--task"} & set(words)
+        main([*words, *SMALL * (words[0] == "imitate"), *("--queries", "8") * generated])
+        if words[0] == "imitate":
+            out = words[words.index("--out") + 1] if "--out" in words else "imitation"
+            assert np.isfinite(json.loads((tmp_path / out / "result.json").read_text())["loss"]["end"]), line
+        if words[0] == "demonstrate":
+            assert tdf.load_demonstration("demo.npz").grasp in (0, 12), line
 
 
 def test_shapes(run, capsys):
