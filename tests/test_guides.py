@@ -138,10 +138,10 @@ def test_command_lines_are_understood(page, line, monkeypatch):
     assert seen == [words[1]]
 
 
-# Lines that the test below runs, by page, with the fewest starts, query points and sampled points. The other lines are
-# understood only: each takes minutes with any settings (evaluate, benchmark, simulate, dataset, train, reproduce), or
-# waits for a user (view), needs a robot's file of another project (simulate --robot) or weights of such a run, or is one
-# of these lines with another seed or file.
+# Lines that the test below runs, by page, with the fewest starts, query points and sampled points. The other lines
+# are understood only: each takes minutes with any settings (evaluate, benchmark, simulate, dataset, train,
+# reproduce), waits for a user (view), needs a robot's file of another project (simulate --robot) or weights of such a
+# run, or is one of these lines with another seed or file.
 SMALL = ("--num-starts", "2", "--points", "200", "--no-plots")
 RUN = {
     "installation": ("tdf imitate", "tdf env"),

@@ -8,6 +8,7 @@ Modules:
     deprecation: names of the release before
     devices: work shared among devices
     errors: the exception of a user's mistake, and warnings
+    extras: modules of packages that an extra installs
     files: atomic writes
     precision: full float32 products on every device
     units: units of length

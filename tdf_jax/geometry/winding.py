@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float
 
-from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.extras import from_extra
 
 if TYPE_CHECKING:
     import trimesh
@@ -68,10 +68,4 @@ def libigl(function: str):
     Raises:
         InputError: libigl is not installed.
     """
-    try:
-        import igl
-    except ImportError:
-        raise InputError(
-            f"{function}: libigl is not installed; expected the extra 'mesh'; run: pip install 'tdf_jax[mesh]'"
-        ) from None
-    return igl
+    return from_extra(function, "igl", "mesh", "libigl")

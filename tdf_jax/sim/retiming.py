@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from tdf_jax._internal import checks
 from tdf_jax._internal.boundary import host
 from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.extras import from_extra
 
 COINCIDENT = 1e-6  # radians (of all joints together) that no encoder resolves; the direction between such is noise
 MARGIN = 0.9  # of the deviation that is asked for: it is measured at a few places of each interval
@@ -132,15 +133,9 @@ def _limits(name: str, value: ArrayLike, joints: int, unit: str) -> Float[np.nda
 
 
 def _toppra(function: str) -> Any:
-    try:
-        import toppra  # pyright: ignore[reportMissingImports]
-        import toppra.algorithm  # pyright: ignore[reportMissingImports]
-        import toppra.constraint  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise InputError(
-            f"{function}: toppra is not installed; expected the extra 'sim'; run: pip install 'tdf_jax[sim]'"
-        ) from None
-    return toppra
+    for part in ("toppra.algorithm", "toppra.constraint"):  # attributes of the package once they are imported
+        from_extra(function, part, "sim", "toppra")
+    return from_extra(function, "toppra", "sim")
 
 
 def _distinct(waypoints: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import Any
 
 from tdf_jax._internal import checks
 from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.extras import from_extra
 
 HOST, PORT = "127.0.0.1", 8080
 
@@ -21,13 +22,7 @@ def viser_of(function: str) -> Any:
     Raises:
         InputError: it is not installed.
     """
-    try:
-        import viser
-    except ImportError:
-        raise InputError(
-            f"{function}: viser is not installed; expected it for the viewer: pip install 'tdf_jax[viewer]'"
-        ) from None
-    return viser
+    return from_extra(function, "viser", "viewer")
 
 
 @contextlib.contextmanager

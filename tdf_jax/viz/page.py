@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from tdf_jax._internal.errors import InputError
+from tdf_jax._internal.extras import from_extra
 from tdf_jax._internal.files import replace_file
 from tdf_jax.viz.style import INK
 
@@ -137,13 +138,7 @@ def pages(function: str) -> Any:
     Raises:
         InputError: it is not installed.
     """
-    try:
-        import plotly.graph_objects
-    except ImportError:
-        raise InputError(
-            f"{function}: plotly is not installed; expected it for pages: pip install 'tdf_jax[pages]'"
-        ) from None
-    return plotly.graph_objects
+    return from_extra(function, "plotly.graph_objects", "pages", "plotly")
 
 
 @dataclasses.dataclass(frozen=True)
