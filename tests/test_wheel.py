@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -43,6 +44,15 @@ def installed(wheel, tmp_path_factory):
     target = tmp_path_factory.mktemp("installed")
     run(*PIP, "install", wheel, "--no-deps", "--target", target)
     return target
+
+
+def test_a_source_distribution_holds_what_its_tests_read():
+    """Its tests can be run where it is unpacked."""
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    held = settings["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
+    sources = "".join(path.read_text() for path in (ROOT / "tests").rglob("*.py"))
+    read = set(re.findall(r'(?:\bROOT|parents\[2\]|parent\.parent) / "([^"/*]+)"', sources)) - {"pyproject.toml"}
+    assert {"docs", ".github"} <= read <= set(held)
 
 
 @pytest.mark.slow
