@@ -292,6 +292,17 @@ def browser():
         chromium.close()
 
 
+def opened(browser, page):
+    """A tab without a network in which a page is drawn, and the errors of its scripts, as they come."""
+    tab, errors = browser.new_page(viewport={"width": 900, "height": 600}), []
+    tab.on("pageerror", lambda error: errors.append(error))  # playwright takes no methods of builtins
+    tab.context.set_offline(True)
+    tab.goto(page.as_uri())
+    tab.wait_for_selector("body[data-ready]", timeout=120_000)
+    tab.wait_for_timeout(1000)
+    return tab, errors
+
+
 def colours_of(png):
     """Number of distinct colours of a screenshot: a blank one has a handful."""
     from PIL import Image

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import colours_of, page_content, short_playback
+from conftest import colours_of, opened, page_content, short_playback
 
 from tdf_jax._internal.errors import InputError
 from tdf_jax.sim.playback_page import save_playback_page
@@ -56,13 +56,7 @@ def test_without_plotly_it_is_refused(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_browser_without_a_network_draws_and_plays_it(page, browser):
-    tab = browser.new_page(viewport={"width": 900, "height": 600})
-    errors = []
-    tab.on("pageerror", lambda error: errors.append(error))
-    tab.context.set_offline(True)
-    tab.goto(page.as_uri())
-    tab.wait_for_selector("body[data-ready]", timeout=120_000)
-    tab.wait_for_timeout(1000)
+    tab, errors = opened(browser, page)
     before = tab.screenshot()
     assert colours_of(before) > 300
     tab.click("#play")

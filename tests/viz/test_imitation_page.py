@@ -3,7 +3,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from conftest import CARRY, carried, colours_of, page_content, random_cloud, random_poses
+from conftest import CARRY, carried, colours_of, opened, page_content, random_cloud, random_poses
 from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
@@ -105,13 +105,7 @@ def test_what_cannot_be_drawn_is_refused(scene, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_browser_without_a_network_draws_turns_and_plays_it(page, browser):
-    tab = browser.new_page(viewport={"width": 900, "height": 600})
-    errors = []
-    tab.on("pageerror", lambda error: errors.append(error))
-    tab.context.set_offline(True)
-    tab.goto(page.as_uri())
-    tab.wait_for_selector("body[data-ready]", timeout=120_000)
-    tab.wait_for_timeout(1000)
+    tab, errors = opened(browser, page)
     before = tab.screenshot()
     assert colours_of(before) > 500
     tab.mouse.move(650, 300)
