@@ -119,7 +119,11 @@ def subsamples(
     parts = [rng.permutation(len(points))[:size] for _ in range(number)]
     if not checks.traced(points):
         cloud = np.asarray(points)
-        return np.stack([thin(cloud, count), *(thin(cloud[part], count) for part in parts)])
+        whole = thin(cloud, count)[None]
+        if not parts:
+            return whole
+        some = cloud[np.stack(parts)]
+        return np.concatenate([whole, np.take_along_axis(some, _farthest(some, count)[..., None], axis=1)])
 
     def chosen(part):
         return part[traced_farthest_point_indices(part, count)]
@@ -156,18 +160,30 @@ def farthest_point_indices(points: Float[np.ndarray, "points 3"], count: int) ->
             f"thin(): points has coordinates of up to {np.abs(points).max():.3g} m, whose squares are no numbers of "
             f"type {points.dtype}; expected metres"
         )
-    x, y, z = np.ascontiguousarray((points - points.mean(axis=0)).T)  # columns: five times faster than rows
-    distance = x * x + y * y + z * z
-    indices = np.empty(count, dtype=np.int64)
-    indices[0] = np.argmax(distance)
+    return _farthest(points[None], count)[0]
+
+
+def _farthest(clouds: Float[np.ndarray, "clouds points 3"], count: int) -> Int[np.ndarray, "clouds subset"]:
+    """`farthest_point_indices` of several clouds of one size at a time, which share the time of a step in Python."""
+    centred = np.stack([cloud - cloud.mean(axis=0) for cloud in clouds])
+    columns = np.ascontiguousarray(np.moveaxis(centred, 2, 0))  # columns: five times faster than rows
+    every = np.arange(len(clouds))
+    distance = columns[0] ** 2 + columns[1] ** 2 + columns[2] ** 2
+    indices = np.empty((count, len(clouds)), dtype=np.int64)
+    indices[0] = distance.argmax(axis=1)
     distance.fill(np.inf)
+    difference, square = np.empty_like(distance), np.empty_like(distance)
     for i in range(1, count):
         last = indices[i - 1]
-        dx, dy, dz = x - x[last], y - y[last], z - z[last]
-        np.minimum(distance, dx * dx + dy * dy + dz * dz, out=distance)
-        distance[last] = -1  # chosen points are not chosen again, even if other points coincide with them
-        indices[i] = np.argmax(distance)
-    return indices
+        square.fill(0)
+        for column in columns:
+            np.subtract(column, column[every, last][:, None], out=difference)
+            np.multiply(difference, difference, out=difference)
+            square += difference
+        np.minimum(distance, square, out=distance)
+        distance[every, last] = -1  # chosen points are not chosen again, even if other points coincide with them
+        distance.argmax(axis=1, out=indices[i])
+    return indices.T
 
 
 def traced_farthest_point_indices(points: Float[Array, "points 3"], count: int) -> Int[Array, " subset"]:

@@ -3,6 +3,8 @@
 A step solves (H + damping diag(H)) delta = -gradient for each pose. The gradient is the energy's own; H is that of the
 absolute values replaced by r^2 / (2 max(|r|, s)), with s the mean |r| of the query point: iteratively reweighted least
 squares, made less steep near zero.
+
+A pose whose next step promises hardly anything leaves: the steps of the others cost less then.
 """
 
 import functools
@@ -18,11 +20,14 @@ from tdf_jax._internal.precision import full_precision
 from tdf_jax.energy.losses import pose_difference
 from tdf_jax.energy.reference import Reference
 from tdf_jax.geometry import se3
-from tdf_jax.networks.field import DescriptorField
+from tdf_jax.networks.occupancy import NORM_FLOOR, decode
 
 LARGEST_ROTATION, LARGEST_TRANSLATION = 0.7, 0.05  # bounds of one step, radians and metres
 DAMPINGS = 1e-3, 1e3  # bounds of the damping
 ACCEPTED, REJECTED = 0.3, 4.0  # factors on the damping after a step
+# A pose leaves when its next step promises less than this share of the tolerance. With 1, energies of picks were 0.1 %
+# higher in the median, and so was the fitted residual; with 0.3, 0.03 %.
+LEAVES = 0.3
 # Metres. The curvature of eq. 3's norm grows without bound towards zero, so no smaller difference enters it.
 LEAST_DIFFERENCE = 1e-4
 
@@ -89,12 +94,15 @@ def descend(
 ):
     """Take damped Gauss-Newton steps until no pose promises to gain more than the tolerance.
 
+    A pose that promises less than `LEAVES` of the tolerance takes no further step, and after half of the steps only the
+    best ones go on.
+
     Args:
         R: rotations of the query frame in the world, (poses, 3, 3).
         centroid: positions of the query points' centroid, (poses, 3), metres, world frame.
         waypoint: index of the waypoint that each pose matches, (poses,).
-        bounds: number of poses that move, number of poses that are evaluated, number of blocks of query points, and
-            maximal number of steps, (4,).
+        bounds: number of poses that move, number of poses that are evaluated, number of blocks of query points,
+            maximal number of steps, and number of poses that go on after half of them, (5,).
         damping: damping of the first step.
         tolerance: share of a pose's energy that its next step has to promise; the loop ends when no pose promises it.
         field: descriptor field of the new object.
@@ -126,25 +134,33 @@ def _steps(R, centroid, waypoint, bounds, damping, tolerance, field, problem, en
         parts, part = jax.lax.axis_size(axes), jax.lax.axis_index(axes)
         # Poses assigned to this device.
         bounds = bounds.at[:2].set((bounds[:2] - part + parts - 1) // parts)
-    moving, evaluated, blocks, steps = bounds
+    moving, evaluated, blocks, steps, kept = bounds
     moves = jnp.arange(len(R)) < moving
 
+    def rank(energy):
+        """How many poses that move have a lower energy, on all devices."""
+        every = jnp.where(moves, energy, jnp.inf)
+        every = jax.lax.all_gather(every, axes, tiled=True) if axes else every
+        return jnp.sum(every < energy[:, None], axis=1)
+
     def body(carry):
-        i, state, damping, step, _, history = carry
+        i, state, damping, step, going, _, history = carry
         R, centroid = se3.multiply(se3.exp(step[:, :3]), state.R), state.centroid + step[:, 3:]
         # A pose that does not move is evaluated once.
-        some = jnp.where(i == 0, evaluated, moving)
+        some = jnp.where(i == 0, jnp.arange(len(R)) < evaluated, going)
         trial = _State(R, centroid, *_evaluate(R, centroid, waypoint, some, blocks, field, problem, energy, chunk))
         # Energies of the initial state are infinite, so the first step accepts every finite energy.
-        better = (jnp.arange(len(R)) < some) & (trial.energy < state.energy)
+        better = some & (trial.energy < state.energy)
         state = jax.tree.map(lambda a, b: jnp.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b), trial, state)
         factor = jnp.where(i == 0, 1.0, jnp.where(better, ACCEPTED, REJECTED))
         damping = jnp.clip(damping * factor, *DAMPINGS)
         step, promise = _step(state, damping)
-        hopeful = jnp.any(moves & (promise > tolerance * state.energy))
+        going = going & (promise > LEAVES * tolerance * state.energy)
+        going = going & ((i < (steps + 1) // 2) | (rank(state.energy) < kept))
+        hopeful = jnp.any(going & (promise > tolerance * state.energy))
         hopeful = jax.lax.pmax(hopeful.astype(jnp.int32), axes) > 0 if axes else hopeful
         history = jnp.where(jnp.arange(length) >= i, state.energy[:, None], history)
-        return i + 1, state, damping, jnp.where(moves[:, None], step, 0.0), hopeful, history
+        return i + 1, state, damping, jnp.where(going[:, None], step, 0.0), going, hopeful, history
 
     count, dtype = len(R), R.dtype
     values = (
@@ -153,8 +169,8 @@ def _steps(R, centroid, waypoint, bounds, damping, tolerance, field, problem, en
         jnp.broadcast_to(jnp.eye(6, dtype=dtype), (count, 6, 6)),
     )
     begin = _State(R, centroid, *values), jnp.full(count, damping, dtype), jnp.zeros((count, 6), dtype)
-    carry = (jnp.int32(0), *begin, jnp.bool_(True), jnp.zeros((count, length), dtype))
-    _, state, _, _, _, history = jax.lax.while_loop(lambda carry: (carry[0] <= steps) & carry[4], body, carry)
+    carry = (jnp.int32(0), *begin, moves, jnp.bool_(True), jnp.zeros((count, length), dtype))
+    _, state, *_, history = jax.lax.while_loop(lambda carry: (carry[0] <= steps) & carry[5], body, carry)
     return state.R, state.centroid, history
 
 
@@ -182,19 +198,20 @@ def _solved(matrix, right):
 
 
 def _evaluate(R, centroid, waypoint, some, blocks, field, problem, energy, chunk):
-    """Energies of the first `some` poses and their quadratic models: (poses,), (poses, 6), (poses, 6, 6).
+    """Energies of the poses `some`, a mask, and their quadratic models: (poses,), (poses, 6), (poses, 6, 6).
 
     What is evaluated at a time are pairs of a pose and a block of query points: few poses with many blocks fill a chunk
     as well as many poses with one.
     """
     every, size = problem.weights.shape
-    count, last = min(max(1, chunk // size), len(R) * every), some * blocks
+    count, last = min(max(1, chunk // size), len(R) * every), jnp.sum(some) * blocks
+    order = jnp.argsort(~some)  # those to evaluate come first
     counted = jnp.arange(every) < blocks
     used = jnp.sum(jnp.where(counted, jnp.sum(problem.weights, axis=1), 0.0))
 
     def evaluated(j, values):
         pair = j * count + jnp.arange(count)
-        pose, block = jnp.minimum(pair // blocks, len(R) - 1), pair % blocks
+        pose, block = order[jnp.minimum(pair // blocks, len(R) - 1)], pair % blocks
         terms = _match(
             R[pose],
             centroid[pose],
@@ -211,7 +228,7 @@ def _evaluate(R, centroid, waypoint, some, blocks, field, problem, energy, chunk
     values = tuple(jnp.zeros((room, *shape), R.dtype) for shape in ((), (6,), (6, 6)))
     values = jax.lax.fori_loop(0, (last + count - 1) // count, evaluated, values)
     # The pairs of each pose; blocks that do not count read the first pair, and are left out.
-    pair = jnp.where(counted, jnp.arange(len(R))[:, None] * blocks + jnp.arange(every), 0)
+    pair = jnp.where(counted, jnp.argsort(order)[:, None] * blocks + jnp.arange(every), 0)
 
     def summed(part):
         return jnp.sum(jnp.where(counted.reshape(1, -1, *[1] * (part.ndim - 1)), part[pair], 0.0), axis=1)
@@ -224,15 +241,22 @@ def _match(R, centroid, field, query, weights, demonstrated):
     """Weighted sum over query points of the mean absolute difference of descriptors, its gradient and its curvature."""
     arm = se3.rotate(R, query)
     x = (arm + centroid[:, None]).reshape(-1, 3)
-    found, tangents = descriptors_and_derivatives(field, x)
-    residual = found - demonstrated.reshape(found.shape)
+    activations, products = _activations_and_derivatives(field, x)
+    inverse = 1 / jnp.maximum(jnp.sqrt(products[:, :1]), NORM_FLOOR)
+    residual = activations[:, 0] * inverse - demonstrated.reshape(len(x), -1)
     size = jnp.abs(residual)
     mean = jnp.mean(size, axis=-1)
     weights = weights.ravel()
     share = (weights / size.shape[-1])[:, None]
-    slope = jnp.einsum("pic,pc->pi", tangents, jnp.sign(residual) * share)
-    weighted = tangents * (share / jnp.maximum(jnp.maximum(size, mean[:, None]), 1e-9))[:, None]
-    curvature = jnp.einsum("pic,pjc->pij", tangents, weighted)
+    signed = jnp.einsum("pic,pc->pi", activations, jnp.sign(residual) * share)
+    weighted = activations * (share / jnp.maximum(jnp.maximum(size, mean[:, None]), 1e-9))[:, None]
+    squares = jnp.einsum("pic,pjc->pij", activations, weighted)
+    # The derivative of the descriptor is that of the activations without its part along them, over their length.
+    along = products[:, 1:] * inverse**2
+    slope = inverse * (signed[:, 1:] - along * signed[:, :1])
+    mixed = along[:, :, None] * squares[:, :1, 1:]
+    parallel = along[:, :, None] * along[:, None] * squares[:, :1, :1]
+    curvature = (squares[:, 1:, 1:] - mixed - mixed.swapaxes(1, 2) + parallel) * inverse[:, :, None] ** 2
 
     slope, curvature = slope.reshape(*arm.shape[:2], 3), curvature.reshape(*arm.shape[:2], 3, 3)
     # A rotation w moves a point by w x arm, a translation v by v: rows of the jacobian (poses, size, 6, 3).
@@ -243,20 +267,22 @@ def _match(R, centroid, field, query, weights, demonstrated):
     return jnp.sum((weights * mean).reshape(arm.shape[:2]), axis=1), gradient, hessian
 
 
-def descriptors_and_derivatives(
-    field: DescriptorField, x: Float[Array, "points 3"]
-) -> tuple[Float[Array, "points channels"], Float[Array, "points 3 channels"]]:
-    """Descriptors at points, and their derivatives along the three axes.
+def _activations_and_derivatives(field, x):
+    """What descriptors are made of: activations and their derivatives along the axes, (points, 4, channels).
 
-    Args:
-        field: descriptor field.
-        x: points, (points, 3), metres, world frame.
+    The products of the activations with all four, (points, 4), come with them. Descriptors have unit length; forming
+    them and their derivatives took an eighth of the time of an evaluation.
     """
 
     def along(axis):
-        return jax.jvp(field.descriptors, (x,), (jnp.broadcast_to(axis, x.shape),))
+        return jax.jvp(
+            lambda x: decode(field.conditioned, x - field.origin)[0], (x,), (jnp.broadcast_to(axis, x.shape),)
+        )
 
-    return jax.vmap(along, out_axes=(None, 1))(jnp.eye(3, dtype=x.dtype))
+    value, tangents = jax.vmap(along, out_axes=(None, 1))(jnp.eye(3, dtype=x.dtype))
+    value, tangents = jnp.concatenate(value, axis=-1), jnp.concatenate(tangents, axis=-1)
+    both = jnp.concatenate([value[:, None], tangents], axis=1)
+    return both, jnp.einsum("pic,pc->pi", both, value)
 
 
 def _prior(R, centroid, target, origin, centre, energy):

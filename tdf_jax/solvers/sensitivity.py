@@ -24,7 +24,6 @@ from tdf_jax._internal.precision import full_precision
 from tdf_jax.energy.reference import Reference
 from tdf_jax.geometry import se3
 from tdf_jax.networks.field import DescriptorField
-from tdf_jax.solvers.gauss_newton import descriptors_and_derivatives
 from tdf_jax.solvers.initial import check_channels
 
 # Directions whose curvature is below this share of the stiffest one's are free, as in `pose_covariance`.
@@ -180,7 +179,7 @@ def _model(field, query, demonstrated, pick):
     scale = jnp.sqrt(jnp.mean(jnp.sum(arm**2, axis=-1)))
     # Coincident query points determine no rotation: its curvature is zero, whatever a rotation counts as.
     scale = jnp.where(scale > 0, scale, SCALE)
-    found, tangents = descriptors_and_derivatives(field, se3.transform(pick, query))
+    found, tangents = _descriptors_and_derivatives(field, se3.transform(pick, query))
     residual = found - demonstrated
     across = jnp.cross(jnp.eye(3, dtype=found.dtype)[None], arm[:, None])
     jacobian = jnp.concatenate([jnp.einsum("qai,qic->qac", across, tangents), scale * tangents], axis=1)
@@ -194,3 +193,12 @@ def _model(field, query, demonstrated, pick):
     shares = curvatures / jnp.where(curvatures[-1] > 0, curvatures[-1], 1.0)
     offset = scale * jnp.linalg.norm(model.solved(residual))
     return model, DifferentiablePick(pick, directions, shares, jnp.sum(~determined), offset, scale)
+
+
+def _descriptors_and_derivatives(field, x):
+    """Descriptors at points, (points, channels), and their derivatives along the three axes, (points, 3, channels)."""
+
+    def along(axis):
+        return jax.jvp(field.descriptors, (x,), (jnp.broadcast_to(axis, x.shape),))
+
+    return jax.vmap(along, out_axes=(None, 1))(jnp.eye(3, dtype=x.dtype))

@@ -81,7 +81,9 @@ class Plan(NamedTuple):
         """The argument `bounds` of `gauss_newton.descend`."""
         moving, polish = math.prod(self.shape(stage)), stage == "polish"
         evaluated = moving + (self.num_poses - self.free if polish else 0)
-        return np.array([moving, evaluated, num_blocks if polish else 1, self.num_steps(stage)], np.int32)
+        # Half of the starts are given up early, but not fewer go on than the next stage takes.
+        kept = max(moving // 2, math.prod(self.shape("prune"))) if stage == "coarse" else moving
+        return np.array([moving, evaluated, num_blocks if polish else 1, self.num_steps(stage), kept], np.int32)
 
 
 class Candidates(NamedTuple):

@@ -246,7 +246,7 @@ def _track(last, origin, latent, rotation, tolerance, field, pick, *, sizes):
     # Both stages run one program: polish moves the first candidate only, but has room for as many.
     steps = np.array([sizes.refine_steps, sizes.polish_steps], np.int32)
     moving, blocks = np.array([sizes.candidates, 1], np.int32), np.array([1, len(problem.query)], np.int32)
-    bounds = np.stack([moving, moving, blocks, steps], axis=1)
+    bounds = np.stack([moving, moving, blocks, steps, moving], axis=1)
     energy = jax.tree.map(lambda weight: jnp.asarray(weight, R.dtype), EnergyWeights(0.0))
 
     def stage(state, limits):

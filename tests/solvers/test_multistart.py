@@ -79,7 +79,9 @@ def test_energies_and_gradients_are_those_of_the_energy(field, reference, pose_n
     drawn = stages.candidates_of(np, starts, problem)
     R, place = drawn.R.reshape(-1, 3, 3), drawn.centroid.reshape(-1, 3)
     waypoint = np.tile(np.arange(4), 5)
-    values = evaluate(R, place, waypoint, 20, 3, field, problem, weights, 128)
+    some = np.arange(20) % 3 != 1  # 13 poses, not one after the other
+    values = evaluate(R, place, waypoint, some, 3, field, problem, weights, 128)
+    values = [part[some] for part in values]
 
     def energy(step, R, place, index):
         R, place = moved(R, place, step)
@@ -90,8 +92,8 @@ def test_energies_and_gradients_are_those_of_the_energy(field, reference, pose_n
 
     each = jax.jit(jax.vmap(jax.value_and_grad(energy), (None, 0, 0, 0)))
     expected, gradient = each(jnp.zeros(6), R, place, waypoint)
-    np.testing.assert_allclose(values[0], expected, rtol=1e-5)
-    np.testing.assert_allclose(values[1], gradient, atol=1e-4 * np.abs(gradient).max())
+    np.testing.assert_allclose(values[0], expected[some], rtol=1e-5)
+    np.testing.assert_allclose(values[1], gradient[some], atol=1e-4 * np.abs(gradient).max())
 
 
 @pytest.mark.parametrize("pose_norm", ["metres_radians", "mean_absolute"])
@@ -162,6 +164,41 @@ def test_a_step_solves_the_damped_system_and_is_bounded():
     np.testing.assert_allclose(cosine, 1, atol=1e-4)
 
 
+def descended(field, reference, bounds, tolerance):
+    """Energies of 8 poses at the start and after each of 6 steps."""
+    problem = solve._problem(KEY, reference, size=8)
+    drawn = stages.candidates_of(np, random_starts(KEY, field, reference, 2, "carried", 0.1), problem)
+    _, _, values = gauss_newton.descend(
+        drawn.R.reshape(-1, 3, 3),
+        drawn.centroid.reshape(-1, 3),
+        np.tile(np.arange(4), 2),
+        np.array(bounds, np.int32),
+        *(np.float32(0.3), np.float32(tolerance), field, problem, WEIGHTS),
+        length=7,
+        chunk=128,
+    )
+    return np.asarray(values)
+
+
+def test_after_half_of_the_steps_only_the_best_poses_go_on(field, reference):
+    every, some = (descended(field, reference, [8, 8, 1, 6, kept], 0.0) for kept in (8, 3))
+    np.testing.assert_array_equal(some[:, :4], every[:, :4])
+    best = np.argsort(np.argsort(every[:, 3])) < 3
+    np.testing.assert_array_equal(some[best], every[best])
+    np.testing.assert_array_equal(some[~best, 4:], np.repeat(every[~best, 3:4], 3, axis=1))
+    assert (every[~best, 6] < every[~best, 3]).any()
+
+
+def test_a_pose_that_promises_hardly_anything_leaves(field, reference):
+    """Poses are independent, so one that leaves takes the steps that it takes alone, but for those after its last."""
+    every, some = (descended(field, reference, [8, 8, 1, 6, 8], tolerance) for tolerance in (0.0, 0.1))
+    steps = np.array([np.flatnonzero(one != other)[:1].sum() or 7 for one, other in zip(every, some)])
+    assert steps.min() < 7
+    for one, other, step in zip(every, some, steps):
+        np.testing.assert_array_equal(one[:step], other[:step])
+        assert (other[step:] == other[step - 1]).all()
+
+
 @pytest.mark.slow
 def test_chunks_do_not_show(field, reference):
     problem = solve._problem(KEY, reference, size=3)
@@ -170,7 +207,7 @@ def test_chunks_do_not_show(field, reference):
         drawn.R.reshape(-1, 3, 3),
         drawn.centroid.reshape(-1, 3),
         np.tile(np.arange(4), 2),
-        *(8, 3, field, problem, WEIGHTS),
+        *(np.full(8, True), 3, field, problem, WEIGHTS),
     )
     # 24 pairs of a pose and a block: 3 at a time, 5 at a time, where the last chunk has fewer, and all at once.
     whole = evaluate(*settings, 128)
@@ -184,8 +221,8 @@ def test_poses_beyond_those_that_count_have_no_part_in_the_energy(field, referen
     problem = solve._problem(KEY, reference, size=3)
     drawn = stages.candidates_of(np, random_starts(KEY, field, reference, 2, "carried", 0.1), problem)
     poses = drawn.R.reshape(-1, 3, 3), drawn.centroid.reshape(-1, 3), np.tile(np.arange(4), 2)
-    whole = evaluate(*poses, 8, 3, field, problem, WEIGHTS, 9)
-    first = evaluate(*poses, 5, 3, field, problem, WEIGHTS, 9)
+    whole = evaluate(*poses, np.arange(8) < 8, 3, field, problem, WEIGHTS, 9)
+    first = evaluate(*poses, np.arange(8) < 5, 3, field, problem, WEIGHTS, 9)
     for part, expected in zip(first, whole, strict=True):
         np.testing.assert_allclose(part[:5], expected[:5], rtol=1e-4, atol=1e-6)
 
