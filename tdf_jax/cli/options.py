@@ -34,7 +34,8 @@ class SceneSettings:
         scale: metres per unit of the target file, such as 0.01 for centimetres.
         drop_invalid: remove points of the target file that are NaN or stand for missing measurements.
         target_pose: pose of the target in the world: that of its file, or a random rotation and translation of it.
-        demonstration: .npz file that `tdf demonstrate` wrote, or with the arrays points, wxyz_xyz and query, in metres.
+        demonstration: .npz file of `tdf demonstrate` or `tdf view --demonstrate`, or with the arrays points, wxyz_xyz
+            and query, in metres.
         category: category of generated objects.
         trajectory: shape of a generated demonstration, from the category's first place, such as a mug's handle,
             to a place 0.30 m away; lift_over ends on a shelf there.

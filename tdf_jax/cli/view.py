@@ -1,14 +1,18 @@
-"""`tdf view`: an imitation, a landscape or simulated episodes in a browser."""
+"""`tdf view`: an imitation, a landscape, simulated episodes or a joint trajectory in a browser."""
 
+import contextlib
+import re
 import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from tdf_jax._internal.errors import InputError
 
 _NONE = "(default: none)"
+FUNCTION = re.compile(r"^[\w.]+\(\): ")  # the beginning of an error of the library
 
 
 class Waiting(threading.Event):
@@ -24,6 +28,8 @@ def view(
     weights: Annotated[
         str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint="(default: those of the folder)")
     ] = None,
+    robot: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: UR5e and 2F-85)")] = None,
+    site: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint=_NONE)] = None,
     port: int = 8080,
     share: bool = False,
     no_browser: bool = False,
@@ -32,95 +38,138 @@ def view(
 
     It needs the extra "viewer".
 
-    The object and its goal can be dragged: the pick is found again, and the path follows. Simulated episodes are
-    played. The address is this machine's own.
+    The object and its goal can be dragged: the pick is found again, and the path follows. Simulated episodes and joint
+    trajectories are played. The address is this machine's own.
 
     Args:
-        folder: folder that `tdf imitate`, `tdf landscape`, `tdf simulate` or `tdf benchmark --simulation` wrote; with
-            --demonstrate, mesh or cloud of the object.
+        folder: folder that `tdf imitate`, `tdf landscape`, `tdf simulate` or `tdf benchmark --simulation` wrote, or an
+            .npz file in it; a joint trajectory, .npz or .csv; with --demonstrate, mesh or cloud of the object.
         demonstrate: .npz file for a demonstration that is made by hand on the object: drag a box of query points along
             key poses.
         scale: metres per unit of the object's file, such as 0.01 for centimetres.
         landscape: folder of `tdf landscape` to show with an imitation.
         episode: number of the simulated episode that is shown first.
         weights: weights of the object, if they are not where the folder says.
+        robot: MJCF of the robot of a joint trajectory, which needs the extra "sim".
+        site: site of that file that is the gripper's frame.
         port: port of the address; 0 for any that is free.
         share: make a public link as well, by the relay of viser's authors: whoever has it sees and moves everything.
         no_browser: open no browser; print the address alone.
     """
-    from tdf_jax.landscape.storage import load_landscape
-    from tdf_jax.solvers.imitation_scene import SCENE, load_imitation
-    from tdf_jax.viewer.energies import show_landscape
-    from tdf_jax.viewer.episodes import EpisodeStage
-    from tdf_jax.viewer.handles import look
-    from tdf_jax.viewer.local_server import serving, viser_of
-    from tdf_jax.viewer.solving import model_of, problem_of
-    from tdf_jax.viewer.stage import Stage
+    options = {
+        "--landscape": landscape,
+        "--episode": episode,
+        "--weights": weights,
+        "--robot": robot,
+        "--site": site,
+    }
+    with _named():
+        from tdf_jax.viewer.local_server import serving, viser_of
 
-    viser_of("tdf view")
-    if demonstrate is not None:
-        if landscape is not None or weights is not None or episode is not None:
-            raise InputError("tdf view: --demonstrate has no use for --landscape, --episode and --weights; drop them")
-        _demonstrate(folder, demonstrate, scale, port, share, no_browser)
-        return
-    if scale != 1:
-        raise InputError("tdf view: --scale is for an object with --demonstrate; give that, or drop --scale")
-    if folder.is_file() and folder.suffix != ".npz":
-        raise InputError(
-            f"tdf view: {folder} is a file; expected a folder of `tdf imitate`, `tdf landscape` or `tdf simulate`. To "
-            "make a demonstration on an object, add --demonstrate FILE"
-        )
-    simulated = _simulated(folder)
-    if simulated is not None:
-        if landscape is not None or weights is not None:
-            raise InputError(f"tdf view: {folder} holds simulated episodes; drop --landscape and --weights")
+        viser_of("tdf view")
+        if demonstrate is not None:
+            _refuse_options("--demonstrate", set(), options)
+            show = _demonstration(folder, demonstrate, scale)
+        elif scale != 1:
+            raise InputError("tdf view: --scale is for an object with --demonstrate; give that, or drop --scale")
+        else:
+            show = _results(folder, options)
         with serving("tdf view", port) as server:
-            episodes = EpisodeStage(server, simulated, episode)
+            stage = show(server)
             try:
                 _wait(server, share, no_browser)
             finally:
-                episodes.close()
-        return
-    if episode is not None:
-        raise InputError(f"tdf view: {folder} is no folder of `tdf simulate`; expected one for --episode; drop it")
-    alone = not (folder / SCENE).exists() and (folder / "landscape.npz").is_file()
-    if alone and landscape is not None:
-        raise InputError(f"tdf view: {folder} is a landscape, and there is --landscape {landscape}; drop one")
-    if not alone and folder.is_dir() and not (folder / SCENE).is_file() and any(folder.iterdir()):
+                if stage is not None:
+                    stage.close()
+
+
+@contextlib.contextmanager
+def _named() -> Iterator[None]:
+    """Name the command in errors, not the function that found them."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(FUNCTION.sub("tdf view: ", str(error))) from None
+
+
+def _refuse_options(what: str, known: set[str], options: dict[str, Any]) -> None:
+    wrong = [name for name, value in options.items() if value is not None and name not in known]
+    if wrong:
         raise InputError(
-            f"tdf view: {folder} has no {SCENE}, landscape.npz or episodes; expected a folder of `tdf imitate`, "
-            "`tdf landscape` or `tdf simulate` of this version. Of other commands, see the pictures"
+            f"tdf view: {what} has no use for {', '.join(wrong)}; drop {'it' if len(wrong) == 1 else 'them'}"
         )
-    file = folder / "landscape.npz" if alone else None if landscape is None else landscape / "landscape.npz"
-    energies = None if file is None else load_landscape(file)[0]
-    problem = None
-    if not alone:
-        scene = load_imitation(folder)
-        problem = problem_of(scene, model_of(scene, weights))
-    with serving("tdf view", port) as server:
-        stage = None if problem is None else Stage(server, problem, energies)
-        if problem is None and energies is not None:
-            show_landscape(server, energies)
-            look(server, energies.grid.points.reshape(-1, 3))
-        try:
-            _wait(server, share, no_browser)
-        finally:
-            if stage is not None:
-                stage.close()
 
 
-def _simulated(folder: Path) -> Path | None:
-    """The folder of simulated episodes: this one, or that of the runs in the folder of a benchmark."""
-    from tdf_jax.sim.playback import FOLDER
+def _results(folder: Path, options: dict[str, Any]) -> Callable[[Any], Any]:
+    """Read what there is to show; what is returned shows it on a server, and returns what is to be closed."""
+    from tdf_jax.viewer.sources import EPISODES, IMITATION, LANDSCAPE, source_of
 
-    return next((one for one in (folder, folder / "runs") if (one / FOLDER).is_dir()), None)
+    source = source_of(folder)
+    if source.kind == IMITATION:
+        _refuse_options(f"{folder}, an imitation,", {"--landscape", "--weights"}, options)
+        return _imitation(source.path, options["--landscape"], options["--weights"])
+    if source.kind == LANDSCAPE:
+        _refuse_options(f"{folder}, a landscape,", set(), options)
+        return _landscape(source.path)
+    if source.kind == EPISODES:
+        _refuse_options(f"{folder}, simulated episodes,", {"--episode"}, options)
+        return _episodes(source, options["--episode"])
+    _refuse_options(f"{folder}, a joint trajectory,", {"--robot", "--site"}, options)
+    return _joints(source.path, options["--robot"], options["--site"])
 
 
-def _demonstrate(file: Path, path: Path, scale: float, port: int, share: bool, no_browser: bool) -> None:
+def _imitation(path: Path, landscape: Path | None, weights: str | None) -> Callable[[Any], Any]:
+    from tdf_jax.landscape.storage import load_landscape
+    from tdf_jax.solvers.imitation_scene import load_imitation
+    from tdf_jax.viewer.energies import check_landscape_of
+    from tdf_jax.viewer.solving import model_of, problem_of
+    from tdf_jax.viewer.sources import LANDSCAPE_FILE
+    from tdf_jax.viewer.stage import Stage
+
+    energies = None
+    if landscape is not None:
+        energies = load_landscape(landscape / LANDSCAPE_FILE if landscape.suffix != ".npz" else landscape)[0]
+    scene = load_imitation(path)
+    problem = problem_of(scene, model_of(scene, weights))
+    if landscape is not None and energies is not None:
+        check_landscape_of(problem, energies, landscape)
+    return lambda server: Stage(server, problem, energies)
+
+
+def _landscape(file: Path) -> Callable[[Any], Any]:
+    from tdf_jax.landscape.storage import load_landscape
+    from tdf_jax.viewer.energies import show_landscape
+    from tdf_jax.viewer.handles import look
+
+    energies = load_landscape(file)[0]
+
+    def show(server):
+        show_landscape(server, energies)
+        look(server, energies.grid.points.reshape(-1, 3))
+
+    return show
+
+
+def _episodes(source: Any, number: int | None) -> Callable[[Any], Any]:
+    from tdf_jax.viewer.episodes import EpisodeStage
+
+    return lambda server: EpisodeStage(server, source.path, source.episode if number is None else number)
+
+
+def _joints(file: Path, robot: Path | None, site: str | None) -> Callable[[Any], Any]:
+    from tdf_jax.sim.joint_trajectory import load_joint_trajectory
+    from tdf_jax.sim.robot import load_robot
+    from tdf_jax.viewer.joints import JointStage
+
+    trajectory = load_joint_trajectory(file)
+    loaded = load_robot(robot, site)
+    return lambda server: JointStage(server, trajectory, loaded)
+
+
+def _demonstration(file: Path, path: Path, scale: float) -> Callable[[Any], Any]:
     from tdf_jax.io.meshes import load_mesh
     from tdf_jax.io.pointclouds import load_points
     from tdf_jax.viewer.demonstrating import DemonstrationStage, check_demonstration_path
-    from tdf_jax.viewer.local_server import serving
 
     check_demonstration_path("tdf view", path)
     points = load_points(file, scale=scale)
@@ -128,12 +177,14 @@ def _demonstrate(file: Path, path: Path, scale: float, port: int, share: bool, n
         mesh = load_mesh(file, scale)
     except InputError:  # the file has no faces; it has just been read as a cloud
         mesh = None
-    with serving("tdf view", port) as server:
+
+    def show(server):
         DemonstrationStage(server, points, path, mesh)
-        _wait(server, share, no_browser)
+
+    return show
 
 
-def _wait(server, share: bool, no_browser: bool) -> None:
+def _wait(server: Any, share: bool, no_browser: bool) -> None:
     """Say where the server is, open it, and wait for Ctrl-C."""
     import webbrowser
 
@@ -144,5 +195,10 @@ def _wait(server, share: bool, no_browser: bool) -> None:
         link = shared_address("tdf view", server)
         print(f"{link}  (public: whoever has it sees and moves everything)", flush=True)
     if not no_browser:
-        webbrowser.open(address(server))
+        try:
+            opened = webbrowser.open(address(server))
+        except webbrowser.Error:
+            opened = False
+        if not opened:
+            print("No browser was opened; open the address yourself.", flush=True)
     Waiting().wait()

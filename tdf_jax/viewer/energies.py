@@ -1,5 +1,6 @@
 """An energy landscape on the screen."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -7,8 +8,32 @@ import numpy as np
 from tdf_jax._internal.errors import InputError
 from tdf_jax.landscape.storage import Landscape
 from tdf_jax.viewer import handles
+from tdf_jax.viewer.solving import Problem
 from tdf_jax.viz.landscapes import LEVELS, SURFACES, isosurface
-from tdf_jax.viz.style import TRUTH, WAYPOINTS
+from tdf_jax.viz.style import CLOUD, TRUTH
+
+NEAR = 0.02  # metres between the first waypoints of an imitation and its landscape, whose clouds may be other samples
+
+
+def check_landscape_of(problem: Problem, landscape: Landscape, folder: Path) -> None:
+    """Check that a landscape is of an imitation's demonstration and object, where the object was.
+
+    Args:
+        problem: the imitation.
+        landscape: the landscape.
+        folder: its folder, for the error message.
+
+    Raises:
+        InputError: its first waypoint is not where the demonstrated pick is when it is moved with the centroid.
+    """
+    expected = np.asarray(problem.reference.trajectory.translations[0] + problem.field.origin)
+    away = float(np.linalg.norm(landscape.waypoints[0] - expected))
+    if away > NEAR:
+        raise InputError(
+            f"tdf view: the landscape {folder} has its first waypoint {100 * away:.1f} cm from that of the imitation; "
+            f"expected at most {100 * NEAR:g} cm: a landscape of the same demonstration and of the same object in the "
+            f"same pose. See it alone with `tdf view {folder}`"
+        )
 
 
 def show_landscape(server: Any, landscape: Landscape) -> None:
@@ -25,11 +50,12 @@ def show_landscape(server: Any, landscape: Landscape) -> None:
             "orientation, or the best of several"
         )
     low, high = float(np.nanmin(energy)), float(np.nanmax(energy))
-    marks = [
-        handles.add_path(server, "/landscape/waypoints", landscape.waypoints, WAYPOINTS),
-        handles.add_cloud(server, "/landscape/minimisers", landscape.minimisers, TRUTH),
-    ]
-    marks[1].point_size = 0.008
+    marks = {
+        "demonstration, moved with the centroid": handles.add_path(
+            server, "/landscape/waypoints", landscape.waypoints, CLOUD
+        ),
+        "minimum of each waypoint": handles.add_crosses(server, "/landscape/minimisers", landscape.minimisers, TRUTH),
+    }
     nodes: dict[str, Any] = {}
 
     def slice_at(number: int) -> None:
@@ -39,7 +65,7 @@ def show_landscape(server: Any, landscape: Landscape) -> None:
         nodes["slice"] = plane
 
     with gui.add_folder("Landscape"):
-        gui.add_markdown(f"Energy from {low:.4f} (dark) to {high:.4f} (light); red: minimum of each waypoint.")
+        gui.add_markdown(f"Energy from {low:.4f} (dark) to {high:.4f} (light); red: the minimum of each waypoint.")
         if energy.ndim == 2:
             nodes["slice"] = handles.add_map(server, "/landscape/slice", points, energy, (low, high))
         else:
@@ -50,12 +76,15 @@ def show_landscape(server: Any, landscape: Landscape) -> None:
             for share, colour in zip(LEVELS, SURFACES):
                 try:
                     triangles = isosurface(landscape, share)
-                except InputError:  # libigl is an extra
+                except InputError as error:  # libigl is an extra
+                    gui.add_markdown(f"There are no surfaces of equal energy: {error}.")
                     break
                 node = handles.add_triangles(server, f"/landscape/surface{share}", triangles, colour, 0.35)
                 _switch(gui, f"surface of the least {100 * share:.0f} %", node)
         shown = gui.add_checkbox("plane", True)
         shown.on_update(lambda event: setattr(nodes["slice"], "visible", event.target.value))
+        for name, node in marks.items():
+            _switch(gui, name, node)
 
 
 def _switch(gui: Any, name: str, node: Any) -> None:

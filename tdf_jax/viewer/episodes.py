@@ -10,11 +10,10 @@ from tdf_jax.sim.playback import RATE, kept_episodes, load_playback
 from tdf_jax.sim.playback_page import episode_page
 from tdf_jax.sim.workcell import OBJECT, TABLE_NAME, TARGET
 from tdf_jax.viewer import handles
-from tdf_jax.viewer.player import Player
+from tdf_jax.viewer.player import SPEEDS, Player
 from tdf_jax.viz.style import COLOURS, INK
 
 ALL, SUCCESSES, FAILURES = "all", "successes", "failures"
-SPEEDS = {"quarter speed": 0.25, "real time": 1.0, "four times": 4.0}
 PARTS = {OBJECT: "object", TARGET: "target", TABLE_NAME: "table"}  # every other body is a part of the robot
 ROBOT, CLOUD, IMITATED = "robot", "cloud of the object", "imitated path of the gripper"
 
@@ -25,13 +24,13 @@ class EpisodeStage:
     Args:
         server: the `viser.ViserServer`.
         folder: folder of `tdf simulate`, or the folder runs of `tdf benchmark --simulation`.
-        number: number of the episode that is shown first; None for the first of all.
+        first: number or file of the episode that is shown first; None for the first of all.
 
     Raises:
         InputError: the folder keeps no episode, or none of that number, or a file cannot be read.
     """
 
-    def __init__(self, server: Any, folder: Path, number: int | None = None):
+    def __init__(self, server: Any, folder: Path, first: int | Path | None = None):
         self.server = server
         self._episodes = kept_episodes("tdf view", folder)
         if not self._episodes:
@@ -40,11 +39,15 @@ class EpisodeStage:
                 "`tdf simulate` wrote: run it again with another --out"
             )
         chosen = 0
-        if number is not None:
-            found = [place for place, (_, about) in enumerate(self._episodes) if about["number"] == number]
+        if first is not None:
+            found = [
+                place
+                for place, (file, about) in enumerate(self._episodes)
+                if (file.name == first.name if isinstance(first, Path) else about["number"] == first)
+            ]
             if not found:
                 kept = ", ".join(map(str, sorted({about["number"] for _, about in self._episodes})))
-                raise InputError(f"tdf view: there is no episode {number} in {folder}; expected one of {kept}")
+                raise InputError(f"tdf view: there is no episode {first} in {folder}; expected one of {kept}")
             chosen = found[0]
         self.playback = load_playback("tdf view", self._episodes[chosen][0])
         self._bodies: dict[str, Any] = {}

@@ -11,6 +11,7 @@ from tdf_jax.viz.scene3d import MOST_TRIANGLES, bounds, thinned
 from tdf_jax.viz.style import COLOURS, VIEW
 
 POINT, LINE = 0.0022, 0.0016  # metres: edge of a point, thickness of a line
+ARM = 0.005  # metres, from the middle of a cross
 FIELD_OF_VIEW = 45.0  # degrees
 AMBIENT = 1.2  # light from everywhere, in viser's unit, so that no side is black
 CELL = 0.05  # metres, cells of the floor
@@ -121,6 +122,20 @@ def add_path(server: Any, name: str, xyz: Float[np.ndarray, "poses 3"], colour: 
     return server.scene.add_line_segments(name, path_segments(np.asarray(xyz)), rgb(colour), thickness=LINE)
 
 
+def add_crosses(server: Any, name: str, xyz: Float[np.ndarray, "points 3"], colour: Any) -> Any:
+    """Add a cross of three lines at every point, which a plane through the point does not hide.
+
+    Args:
+        server: the `viser.ViserServer`.
+        name: name of the node.
+        xyz: the points, (points, 3).
+        colour: their colour.
+    """
+    arms = np.stack([-ARM * np.eye(3), ARM * np.eye(3)], axis=1)
+    segments = (np.asarray(xyz)[:, None, None] + arms).reshape(-1, 2, 3)
+    return server.scene.add_line_segments(name, segments, rgb(colour), thickness=LINE)
+
+
 def add_map(
     server: Any,
     name: str,
@@ -173,14 +188,25 @@ def look(server: Any, contents: Float[np.ndarray, "points 3"]) -> None:
     towards = np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
     low, high = contents.min(axis=0), contents.max(axis=0)
     middle, size = (low + high) / 2, high - low
-    distance = 0.58 * np.linalg.norm(size) / np.tan(np.radians(FIELD_OF_VIEW) / 2)
+
+    def from_where(aspect: float) -> np.ndarray:
+        """Position from which the smaller of both fields of view has all in it, for a width in that of the height."""
+        half = np.tan(np.radians(FIELD_OF_VIEW) / 2) * min(1.0, aspect)
+        return middle + 0.58 * np.linalg.norm(size) / half * towards
+
+    def fit(client: Any) -> None:
+        if client.camera.aspect < 1:
+            client.camera.position = from_where(client.camera.aspect)
+            client.camera.look_at = middle
+
+    server.on_client_connect(fit)
     server.scene.set_up_direction("+z")
     # Reflections of surroundings take ten times as long where the processor draws, as on a remote desktop.
     server.scene.configure_environment_map(None)
     server.scene.configure_default_lights(True, cast_shadow=False)
     server.scene.add_light_ambient("/light", intensity=AMBIENT)
     camera = server.initial_camera
-    camera.position, camera.look_at = middle + distance * towards, middle
+    camera.position, camera.look_at = from_where(1.0), middle
     camera.fov, camera.near = np.radians(FIELD_OF_VIEW), 0.005
     cells = np.ceil((size[:2] + 4 * CELL) / CELL) * CELL
     server.scene.add_grid(

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 RATE = 20.0  # frames a second
+SPEEDS = {"quarter speed": 0.25, "real time": 1.0, "four times": 4.0}  # of seconds; the choices of a panel
 
 
 class Player:

@@ -17,7 +17,7 @@ from tdf_jax.viewer.solving import Problem, Solution
 from tdf_jax.viewer.worker import Worker
 from tdf_jax.viz.imitation_page import above
 from tdf_jax.viz.motion import motion_of
-from tdf_jax.viz.style import CLOUD, COLOURS, ESTIMATE, INK, MARKED, TRUTH, VIEW
+from tdf_jax.viz.style import CLOUD, COLOURS, CONTACT, ESTIMATE, INK, MARKED, TRUTH, VIEW
 
 STEP = 0.1  # of the time slider, poses
 POSES_A_SECOND = 2.0
@@ -25,7 +25,7 @@ BESIDE, OVER, HIDDEN = "beside", "over it", "hidden"
 BOX, SURFACE, PROBE = COLOURS(0.35), ESTIMATE, MARKED
 REACH = 0.006  # metres from the ray of a click within which a point is hit
 SHOWN_MODES = 12
-SURFACE_NAME, CONTACT_NAME = "reconstructed surface", "contact regions"
+SURFACE_NAME, CONTACT_NAME, OTHERS = "reconstructed surface", "contact regions", "other picks"
 PAINTING = 2.0  # seconds from a browser's connection to when it has painted
 GRIP = 0.5  # length of the arrows at the object, in its diagonal
 
@@ -82,6 +82,8 @@ class Stage:
         self._path = handles.add_path(server, "/imitation/path", self.solution.path[:, 4:], INK)
         self._box = handles.add_box(server, "/imitation/box", demonstration.query, BOX, 1.6 * handles.LINE)
         self._boxes: list[Any] = []
+        self._picks: list[Any] = []
+        self._visible: dict[str, bool] = {}  # what is switched, by its name
         self._fit(len(self.solution.path))
         self._draw_picks()
         if scene.expected is not None:
@@ -97,7 +99,7 @@ class Stage:
             self._nodes["target"] = [handles.add_cloud(server, "/imitation/target", np.asarray(target), CLOUD)]
         self._contact = None
         if demonstration.target is not None and self.problem.placed:
-            self._contact = handles.add_box(server, "/imitation/contact", demonstration.target.query, TRUTH)
+            self._contact = handles.add_box(server, "/imitation/contact", demonstration.target.query, CONTACT)
             self._nodes[CONTACT_NAME] = [self._contact]
         self._draw_demonstration()
         # It is a place on the object, and moves with it.
@@ -135,14 +137,20 @@ class Stage:
     def _draw_picks(self) -> None:
         modes = self.problem.modes[:SHOWN_MODES]
         low, high = modes[0].energy, modes[-1].energy
-        nodes = []
-        for number, mode in enumerate(modes[1:], 1):
+        for number, mode in enumerate(modes):
             colour = tuple(part / 255 for part in handles.energy_colour(mode.energy, low, high))
             query = self.problem.scene.demonstration.query
             node = handles.add_box(self.server, f"/imitation/object/picks/{number}", query, colour, 0.7 * handles.LINE)
             handles.place(node, mode.pose[:4], mode.pose[4:])
-            nodes.append(node)
-        self._nodes["other picks"] = nodes
+            self._picks.append(node)
+        self._part_picks(0)
+
+    def _part_picks(self, number: int) -> None:
+        """Show all picks as others but one, whose box moves along the path."""
+        visible = self._visible.get(OTHERS, True)
+        self._nodes[OTHERS] = [node for index, node in enumerate(self._picks) if index != number]
+        self._picks[number].visible = False
+        self._set_visible(OTHERS, visible)
 
     def _draw_demonstration(self) -> None:
         scene, server = self.problem.scene, self.server
@@ -158,7 +166,7 @@ class Stage:
             node = handles.add_cloud(server, "/demonstration/target", np.asarray(demonstration.target.points), CLOUD)
             self._nodes["target"].append(node)
             if self._contact is not None:
-                box = handles.add_box(server, "/demonstration/contact", demonstration.target.query, TRUTH)
+                box = handles.add_box(server, "/demonstration/contact", demonstration.target.query, CONTACT)
                 handles.place(box, *np.split(np.asarray(demonstration.target.T_world_contact, float), [4]))
                 self._nodes[CONTACT_NAME].append(box)
         points = np.asarray(demonstration.points, float)
@@ -215,7 +223,7 @@ class Stage:
         with gui.add_folder("Picks"):
             modes = self.problem.modes[:SHOWN_MODES]
             energies = self.problem.pick_energies[: len(modes)]
-            names = [f"{number}: energy {energy:.4f}" for number, energy in enumerate(energies, 1)]
+            names = [f"{number}: energy {energy:.5f}" for number, energy in enumerate(energies, 1)]
             self._choice = gui.add_dropdown("shown", names, initial_value=names[0])
             gui.add_markdown(_table(self.problem))
         self._choice.on_update(lambda event: self._choose(names.index(event.target.value)))
@@ -248,6 +256,7 @@ class Stage:
         switch.on_update(lambda event: self._set_visible(name, event.target.value))
 
     def _set_visible(self, name: str, value: bool) -> None:
+        self._visible[name] = value
         for node in self._nodes.get(name, ()):
             if node is not None:
                 node.visible = value
@@ -299,7 +308,13 @@ class Stage:
         self.player.stop()
         self._grip.wxyz, self._grip.position = np.array([1.0, 0, 0, 0]), self._centroid
         self.player.value = self.problem.scene.result.grasp
-        self.worker.ask("choose", lambda: self._show(solving.chosen(self.problem, number)))
+
+        def choose():
+            self._show(solving.chosen(self.problem, number))
+            with self.server.atomic():
+                self._part_picks(number)
+
+        self.worker.ask("choose", choose)
 
     def _clicked(self, event: Any) -> None:
         if not self._click.value:
@@ -379,9 +394,11 @@ def _words(solution: Solution) -> str:
 
 
 def _table(problem: Problem) -> str:
-    """The distinct picks by rising energy, of the pick alone and, with a target, with those of the contact regions."""
+    """The distinct picks by rising energy: of the pick alone; with a target, by the sum with the contact regions'."""
     modes = problem.modes
-    names = ["pick", "energy", *["with the target's"] * problem.placed, "above the best"]
+    names = ["pick", "energy", "above the best"]
+    if problem.placed:  # the order and the percentages are of the sums
+        names = ["pick", "energy of the pick", "of pick and contact", "the latter above the best"]
     rows = [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
     for number, (mode, energy) in enumerate(zip(modes[:SHOWN_MODES], problem.pick_energies), 1):
         both = [f"{mode.energy:.5f}"] * problem.placed
@@ -389,5 +406,6 @@ def _table(problem: Problem) -> str:
         rows.append(f"| {' | '.join([str(number), f'{energy:.5f}', *both, behind])} |")
     listed = f" (the first {SHOWN_MODES} are listed)" if len(modes) > SHOWN_MODES else ""
     candidates = len(problem.scene.result.energies)
-    words = f"{len(modes)} distinct of {candidates} candidates{listed}; dark boxes have low energies."
+    words = f"{len(modes)} distinct of {candidates} candidates{listed}"
+    words += "; dark boxes have low energies." if len(modes) > 1 else ": there is no second-best pick."
     return "\n".join([*rows, "", words])

@@ -27,6 +27,8 @@ def imitation_figure(
 ) -> Figure:
     """Demonstration and imitation side by side, as in figure 4 of the paper.
 
+    Of a path with more than eight poses, eight boxes are drawn: the first, the last and others evenly between them.
+
     Args:
         demonstration: the demonstration.
         points: cloud of the new object, (points, 3), metres, world frame.

@@ -16,7 +16,7 @@ from tdf_jax.viz.motion import motion_of
 from tdf_jax.viz.page import Page, camera, listed, page_of, pages, scene_axes
 from tdf_jax.viz.scene3d import MOST_TRIANGLES, bounds, thinned
 from tdf_jax.viz.sides import Side, sides_of, sizes_of
-from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, TRUTH, VIEW
+from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, CONTACT, INK, TRUTH, VIEW
 
 RATE = 12  # frames a second
 DISTANCE = 2.6  # of the camera, in the size of the scene
@@ -65,11 +65,13 @@ def imitation_page(function: str, scene: ImitationScene, title: str = "") -> Pag
         _draw(plotly, drawn, moving, name, panel, box)
     if scene.expected is not None:
         _add_expected(plotly, drawn, np.asarray(scene.expected.wxyz_xyz), box, result.grasp)
+    if len(result.target_trajectories):
+        _add_contact_regions(plotly, drawn, scene)
     modes = distinct_picks(scene)
     for number, mode in enumerate(modes[1 : 1 + SHOWN_MODES], 2):
         share = np.interp(number, (2, 1 + SHOWN_MODES), OTHERS)
         corners = _lines(_placed(box, mode.pose))
-        words = f"pick {number}: energy {mode.energy:.4f}, {above(mode, modes[0])}"
+        words = f"pick {number}: {_energy_name(scene)} {mode.energy:.5f}, {above(mode, modes[0])}"
         look = {"visible": "legendonly", "line": {"color": matplotlib.colors.to_hex(COLOURS(share)), "width": 4}}
         drawn.append(_line(plotly, corners, "scene2", words, **look))
     last = poses - 1
@@ -110,7 +112,7 @@ def distinct_picks(scene: ImitationScene) -> list[Mode]:
 def above(mode: Mode, best: Mode) -> str:
     """How much higher the energy of a pick is than that of the best, in words."""
     if not best.energy > 0:
-        return f"{mode.energy - best.energy:.4f} above the best"
+        return f"{mode.energy - best.energy:.5f} above the best"
     return f"{mode.energy / best.energy - 1:.0%} above the best".replace("%", " %")
 
 
@@ -157,6 +159,22 @@ def _add_expected(plotly, drawn: list, wxyz_xyz: np.ndarray, box: np.ndarray, gr
     drawn.append(_line(plotly, _lines(_placed(box, wxyz_xyz[grasp])), "scene2", "truth", showlegend=False, **look))
 
 
+def _add_contact_regions(plotly, drawn: list, scene: ImitationScene) -> None:
+    """Boxes of the contact query points on the demonstrated and on the new target, which do not move."""
+    target = scene.demonstration.target
+    assert target is not None  # there would be no contact poses
+    box = bounds(np.asarray(target.query))
+    poses = (target.T_world_contact, scene.result.target_trajectories[scene.result.best, 0])
+    for panel, pose in zip(("scene", "scene2"), poses):
+        look = {"line": {"color": CONTACT, "width": 5}, "legendgroup": "contact", "showlegend": panel == "scene"}
+        drawn.append(_line(plotly, _lines(_placed(box, np.asarray(pose))), panel, "contact region", **look))
+
+
+def _energy_name(scene: ImitationScene) -> str:
+    """What the energies of candidates are: with a target, those of the contact regions are added."""
+    return "energy of pick and contact" if len(scene.result.target_trajectories) else "energy"
+
+
 def _moving(drawn: list, points: np.ndarray, rotations: np.ndarray, translations: np.ndarray) -> dict:
     """The trace that was drawn last, with its points and motions in the unit of the page."""
     shown = [[None if np.isnan(value) else value for value in row] for row in listed(CENTIMETRES * points.T)]
@@ -194,9 +212,9 @@ def _lead(scene: ImitationScene, modes: list[Mode]) -> str:
     result = scene.result
     confidence, recognised = float(result.confidence), float(result.recognised)
     parts = [f"{len(modes)} distinct pick{'s' if len(modes) != 1 else ''} of {len(result.energies)} candidates"]
-    parts.append(f"the best has energy {modes[0].energy:.4f}")
+    parts.append(f"the best has {_energy_name(scene)} {modes[0].energy:.5f}")
     if len(modes) > 1:
-        parts.append(f"the second {modes[1].energy:.4f}, {above(modes[1], modes[0])}")
+        parts.append(f"the second {modes[1].energy:.5f}, {above(modes[1], modes[0])}")
     lines = ["; ".join(parts) + "."]
     known = [f"confidence {confidence:.2f} that the pick is right to 2 cm and 20 degrees"] * math.isfinite(confidence)
     known += [f"recognised {recognised:.2f} as the demonstration's category"] * math.isfinite(recognised)

@@ -21,9 +21,9 @@ from tdf_jax.geometry.trajectory import Trajectory
 from tdf_jax.solvers.result import Result
 from tdf_jax.viz import polygons3d
 from tdf_jax.viz.scene3d import MARGIN, WIDTH, bounds, frame, thinned
-from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, INK, STYLE, TRUTH, VIEW, add_axes3d, blank_figure, set_view
+from tdf_jax.viz.style import CENTIMETRES, CLOUD, COLOURS, CONTACT, INK, STYLE, VIEW, add_axes3d, blank_figure, set_view
 
-BEFORE, AFTER, TARGET, CONTACT = COLOURS(0.0), COLOURS(0.62), CLOUD, TRUTH
+BEFORE, AFTER, TARGET = COLOURS(0.0), COLOURS(0.62), CLOUD
 HEIGHT = 7.2  # inches
 TITLE = 95  # characters of a line of the title
 SIZE = 2.4  # of a square point, typographic points squared

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 WIDTH = 7.2  # width of a page's text, inches
 SHOWN_POINTS = 1500  # points of a cloud; more points overlap at the width of a page
 TICKS, LABEL = 4, -1.2  # intervals between ticks on the longest axis, and points between ticks and the axis's name
+MOST_BOXES = 8  # along a path: more would hide the object
 MARGIN = 1.06  # length of the axes, in that of their contents
 MOST_TRIANGLES = 40_000  # a mesh with more triangles is drawn as points, because matplotlib would take seconds
 
@@ -82,6 +83,11 @@ def bounds(query: Float[np.ndarray, "queries 3"]) -> Float[np.ndarray, "8 3"]:
     return low + polygons3d.CORNERS * (high - low)
 
 
+def shown_boxes(num_poses: int) -> Int[np.ndarray, " boxes"]:
+    """Indices of the poses whose boxes are drawn, (boxes,): all, or `MOST_BOXES` with the first and the last."""
+    return np.unique(np.linspace(0, num_poses - 1, min(num_poses, MOST_BOXES)).round().astype(int))
+
+
 def _carried(trajectory, box):
     """Corners of the box at every waypoint, (poses, 8, 3), world frame."""
     R, t = np.asarray(trajectory.rotations), np.asarray(trajectory.translations)
@@ -100,7 +106,7 @@ def content(view: View, box: Float[np.ndarray, "8 3"]) -> Float[np.ndarray, "poi
 
 
 def draw(axes: Axes3D, view: View, box: Float[np.ndarray, "8 3"]) -> None:
-    """Draw the object, the boxes and the paths of a view.
+    """Draw the object, the boxes and the paths of a view; of more than `MOST_BOXES` boxes, that many, evenly chosen.
 
     Args:
         axes: the axes.
@@ -115,8 +121,8 @@ def draw(axes: Axes3D, view: View, box: Float[np.ndarray, "8 3"]) -> None:
     else:
         pieces += polygons3d.surface(CENTIMETRES * view.triangles, LIGHT)
     corners = CENTIMETRES * _carried(view.trajectory, box)
-    for fraction, one in zip(np.linspace(0, 1, len(corners)), corners):
-        pieces += polygons3d.box(one, COLOURS(fraction))
+    for index in shown_boxes(len(corners)):
+        pieces += polygons3d.box(corners[index], COLOURS(index / max(1, len(corners) - 1)))
     if view.expected is not None:
         pieces += polygons3d.box(CENTIMETRES * _carried(view.expected, box)[0], TRUTH, filled=False, dashed=True)
     axes.computed_zorder = False
@@ -198,9 +204,10 @@ def waypoint_bar(figure: Figure, num_poses: int, rectangle: tuple[float, float, 
         rectangle: left, bottom, width and height, shares of the figure.
     """
     axes = figure.add_axes(rectangle)
-    norm = BoundaryNorm(np.arange(num_poses + 1) - 0.5, num_poses)
-    colours = ListedColormap(COLOURS(np.linspace(0, 1, num_poses)))
-    bar = figure.colorbar(ScalarMappable(norm, colours), cax=axes, orientation="horizontal", ticks=[0, num_poses - 1])
+    boxes = shown_boxes(num_poses)
+    norm = BoundaryNorm(np.arange(len(boxes) + 1) - 0.5, len(boxes))
+    colours = ListedColormap(COLOURS(boxes / max(1, num_poses - 1)))
+    bar = figure.colorbar(ScalarMappable(norm, colours), cax=axes, orientation="horizontal", ticks=[0, len(boxes) - 1])
     bar.set_ticklabels(["pick", "place"])
     bar.set_label("query boxes; the filled face is +x of the query frame", labelpad=1)
     bar.ax.tick_params(length=0)

@@ -16,6 +16,7 @@ from tdf_jax._internal.files import replace_file
 COLOURS = matplotlib.colormaps["viridis"]  # this map is readable in grey and by the colour-blind
 CLOUD, INK, TRUTH = "#56616e", "#222222", "#d1495b"
 ESTIMATE, MARKED, WAYPOINTS = "#2a6f97", "#f4845f", "#e9c46a"  # estimates; a place or path of its own; waypoints
+CONTACT = "#c77dff"  # contact regions: this lilac is far from the others for every kind of colour blindness
 PALE = "#9aa5b1"  # what is behind the subject
 VIEW = {"elev": 22.0, "azim": -38.0}  # degrees: the handle faces the reader, and the path runs to the right
 CENTIMETRES = 100.0  # unit of pictures; all other code uses metres

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import tdf_jax as tdf
 from tdf_jax.geometry.grid import plane_grid, volume_grid
 from tdf_jax.landscape.storage import Landscape
-from tdf_jax.viewer import energies, solving, stage
+from tdf_jax.viewer import energies, handles, solving, stage
 from tdf_jax.viewer.local_server import address, serving
 
 pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
@@ -222,6 +222,52 @@ def test_another_pick_is_shown_and_the_result_comes_back(shown, problem):
     np.testing.assert_array_equal(shown.solution.pick, problem.modes[number].pose)
     np.testing.assert_array_equal(shown._grip.position, shown._centroid)
     np.testing.assert_array_equal(shown.solution.motion, solving.IDENTITY)
+
+
+def test_the_chosen_pick_is_drawn_once_and_all_others_beside_it(shown, problem):
+    count = len(problem.modes)
+    assert count > 1  # otherwise there are no others
+    for number in (count - 1, 0):
+        shown._choose(number)
+        assert shown.worker.wait(SECONDS)
+        assert [node.visible for node in shown._picks] == [index != number for index in range(count)]
+    shown._set_visible(stage.OTHERS, False)
+    shown._choose(1)
+    assert shown.worker.wait(SECONDS)
+    assert not any(node.visible for node in shown._picks)
+
+
+def test_a_volume_without_libigl_says_that_it_has_no_surfaces(monkeypatch):
+    def missing(landscape, share):
+        raise tdf.InputError("libigl is not installed")
+
+    monkeypatch.setattr(energies, "isosurface", missing)
+    with serving("test", 0) as server:
+        energies.show_landscape(server, bowl(volume_grid(0.2, 4)))
+        words = [getattr(one, "content", "") for one in server.gui._gui_input_handle_from_uuid.values()]
+        words += [
+            getattr(one, "content", "") for one in server.gui._container_handle_from_uuid["root"]._children.values()
+        ]
+        folders = [one for one in server.gui._container_handle_from_uuid.values() if hasattr(one, "_children")]
+        words += [getattr(child, "content", "") for one in folders for child in one._children.values()]
+        assert "There are no surfaces of equal energy: libigl is not installed." in words
+
+
+@pytest.mark.parametrize("aspect", [0.5, 1.6])
+def test_a_narrow_window_has_all_in_it(aspect, problem):
+    """The camera is far enough for the smaller of both fields of view."""
+    camera = type("Camera", (), {"aspect": aspect, "position": None, "look_at": None})()
+    with serving("test", 0) as server:
+        fits = []
+        server.on_client_connect = fits.append
+        handles.look(server, problem.points)
+        (fit,) = fits
+        fit(type("Client", (), {"camera": camera})())
+        near = np.linalg.norm(server.initial_camera.position - server.initial_camera.look_at)
+        if aspect > 1:
+            assert camera.position is None
+        else:
+            np.testing.assert_allclose(np.linalg.norm(camera.position - camera.look_at), 2 * near)
 
 
 @pytest.mark.parametrize("grid", [plane_grid(0.2, 4), volume_grid(0.2, 4)], ids=["plane", "volume"])

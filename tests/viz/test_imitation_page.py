@@ -58,6 +58,22 @@ def test_a_page_is_small_and_needs_no_network(page, scene):
     assert {one["type"] for one in content["data"]} == {"scatter3d", "mesh3d"}
 
 
+def test_contact_regions_are_shown_on_both_targets(placed_scene):
+    page = imitation_page("page()", placed_scene)
+    content = page_content(page.text)
+    regions = [one for one in content["data"] if one["name"] == "contact region"]
+    assert [one["scene"] for one in regions] == ["scene", "scene2"] and len(page.text) < 5_000_000
+    result = placed_scene.result
+    poses = placed_scene.demonstration.target.T_world_contact, result.target_trajectories[result.best, 0]
+    query = np.asarray(placed_scene.demonstration.target.query)
+    for region, pose in zip(regions, poses):
+        drawn = np.array([region[axis] for axis in "xyz"], float).T
+        middle = np.unique(np.round(drawn[np.isfinite(drawn).all(axis=1)], 2), axis=0).mean(axis=0)
+        expected = carried(pose, [(query.min(axis=0) + query.max(axis=0)) / 2])[0]
+        np.testing.assert_allclose(middle, 100 * expected, atol=0.05)
+    assert "energy of pick and contact" in page.text
+
+
 def test_a_doubtful_pick_is_explained_above_the_picture(scene):
     result = dataclasses.replace(scene.result, confidence=np.float32(0.2), points_at_pick=np.int32(3))
     text = imitation_page("page()", dataclasses.replace(scene, result=result)).text

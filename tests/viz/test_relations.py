@@ -9,7 +9,8 @@ from conftest import carried, composed, random_cloud, random_poses
 
 import tdf_jax as tdf
 from tdf_jax._internal.errors import InputError
-from tdf_jax.viz.relations import AFTER, BEFORE, CONTACT, TARGET, relation_figure
+from tdf_jax.viz.relations import AFTER, BEFORE, TARGET, relation_figure
+from tdf_jax.viz.style import CONTACT
 
 PATH = random_poses(1, 4) + [0, 0, 0, 0, 0.3, -0.2, 0.1]
 CLOUD, SHELF = random_cloud(0), random_cloud(5, 50)

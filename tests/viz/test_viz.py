@@ -72,6 +72,14 @@ def test_boxes_are_coloured_from_pick_to_place(demonstration, drawn):
     np.testing.assert_allclose(list(colours), matplotlib.colormaps["viridis"](np.linspace(0, 1, 5))[:, :3])
 
 
+def test_a_long_path_has_eight_boxes(demonstration, drawn):
+    figure = imitation_figure(demonstration, demonstration.points, tdf.wave(num_poses=20))
+    colours = dict.fromkeys(tuple(colour[:3]) for colour in drawn[1].edges)
+    shares = np.round(np.linspace(0, 19, 8)) / 19
+    np.testing.assert_allclose(list(colours), matplotlib.colormaps["viridis"](shares)[:, :3])
+    assert [text.get_text() for text in figure.axes[2].get_xticklabels()] == ["pick", "place"]
+
+
 def test_a_mesh_is_drawn_instead_of_the_points(demonstration, drawn):
     mesh = build_mug().mesh
     reference, test, _ = imitation_figure(
