@@ -195,9 +195,18 @@ def look(server: Any, contents: Float[np.ndarray, "points 3"]) -> None:
         return middle + 0.58 * np.linalg.norm(size) / half * towards
 
     def fit(client: Any) -> None:
-        if client.camera.aspect < 1:
-            client.camera.position = from_where(client.camera.aspect)
-            client.camera.look_at = middle
+        """Step back in a narrow canvas, which the panel makes narrower, until the user moves the camera."""
+        placed = [from_where(1.0)]
+
+        def step_back(camera: Any) -> None:
+            wanted = from_where(camera.aspect)
+            if np.allclose(camera.position, placed[0], atol=1e-3) and not np.allclose(wanted, placed[0], atol=1e-3):
+                placed[0] = wanted
+                camera.position = wanted
+                camera.look_at = middle
+
+        client.camera.on_update(step_back)
+        step_back(client.camera)
 
     server.on_client_connect(fit)
     server.scene.set_up_direction("+z")

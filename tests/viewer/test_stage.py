@@ -256,18 +256,27 @@ def test_a_volume_without_libigl_says_that_it_has_no_surfaces(monkeypatch):
 @pytest.mark.parametrize("aspect", [0.5, 1.6])
 def test_a_narrow_window_has_all_in_it(aspect, problem):
     """The camera is far enough for the smaller of both fields of view."""
-    camera = type("Camera", (), {"aspect": aspect, "position": None, "look_at": None})()
+    changed = []
+    camera = type("Camera", (), {"aspect": 1.6, "position": None, "look_at": None, "on_update": changed.append})()
     with serving("test", 0) as server:
         fits = []
         server.on_client_connect = fits.append
         handles.look(server, problem.points)
         (fit,) = fits
+        near = server.initial_camera
+        camera.position = near.position
         fit(type("Client", (), {"camera": camera})())
-        near = np.linalg.norm(server.initial_camera.position - server.initial_camera.look_at)
-        if aspect > 1:
-            assert camera.position is None
-        else:
-            np.testing.assert_allclose(np.linalg.norm(camera.position - camera.look_at), 2 * near)
+        camera.aspect = aspect  # the panel takes its part of the window
+        for call in changed:
+            call(camera)
+        distance = np.linalg.norm(near.position - near.look_at)
+        found = np.linalg.norm(camera.position - near.look_at)
+        np.testing.assert_allclose(found, distance / min(1, aspect))
+        camera.position, camera.aspect = camera.position + 0.5, 0.4  # the user has moved it
+        moved = camera.position
+        for call in changed:
+            call(camera)
+        assert camera.position is moved
 
 
 @pytest.mark.parametrize("grid", [plane_grid(0.2, 4), volume_grid(0.2, 4)], ids=["plane", "volume"])
