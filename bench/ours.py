@@ -1,8 +1,14 @@
 """The benchmark's tasks in tdf_jax, by its public functions: as `bench.peer`, task for task."""
 
 import functools
+import json
+import os
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +18,7 @@ from flax.traverse_util import unflatten_dict
 
 import tdf_jax as tdf
 from bench import scene
+from bench.workers import ROOT
 from tdf_jax.geometry import se3
 from tdf_jax.networks.occupancy import condition, decode, encode_latent
 
@@ -135,6 +142,48 @@ def picking(model, settings, arrays):
     return call
 
 
+def imitating(model, settings, arrays):
+    """`tdf.imitate_batch` on all clouds, with the shipped weights of mugs, whose clouds are sampled and cleaned."""
+    shipped = tdf.load_model("mug")
+    path, query = tdf.Trajectory(jnp.asarray(arrays["path"])), jnp.asarray(arrays["query"])
+    demonstration = tdf.Demonstration(jnp.asarray(arrays["shown"]), path, query)
+    chunk = settings["chunk"]
+
+    def call():
+        results = tdf.imitate_batch(
+            shipped, demonstration, list(arrays["clouds"]), key=jax.random.key(0), chunk_targets=chunk
+        )
+        jax.block_until_ready(results)
+        return {"energies": np.array([float(result.loss) for result in results])}
+
+    return call
+
+
+def command(model, settings, arrays):
+    """`tdf imitate` with default options as a process, from its start to its end, with or without kept programs."""
+    folder = tempfile.TemporaryDirectory(prefix="bench_")
+    environment = os.environ | {"XDG_CACHE_HOME": folder.name}
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    start = "import sys; from tdf_jax.cli.main import main; sys.exit(main())"
+    flags = [] if settings["kept"] else ["--no-cache"]
+
+    def call():
+        out = Path(folder.name) / "imitation"  # the folder lives as long as this function
+        ended = subprocess.run(
+            [sys.executable, "-c", start, "imitate", "--out", str(out), *flags],
+            cwd=ROOT,
+            env=environment,
+            capture_output=True,
+            text=True,
+        )
+        if ended.returncode:
+            raise RuntimeError(f"tdf imitate ended with {ended.returncode}: {ended.stderr[-500:]}")
+        record = json.loads((out / "result.json").read_text())
+        return {"energy": record["loss"]["end"]}
+
+    return call
+
+
 def landscape(model, settings, arrays):
     """`tdf.energy_landscape`, one energy for each rotation."""
     field, reference, _ = _problem(model, arrays)
@@ -187,7 +236,10 @@ def matmul(model, settings, arrays):
     return lambda: {"corner": jax.block_until_ready(program(a, b))[0, 0]}
 
 
-TASKS = {task.__name__: task for task in (encode, gradient, descent, solving, picking, landscape, train, matmul)}
+TASKS = {
+    task.__name__: task
+    for task in (encode, gradient, descent, solving, picking, imitating, command, landscape, train, matmul)
+}
 
 
 def _problem(model, arrays):

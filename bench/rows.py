@@ -16,6 +16,7 @@ NDF_RATES = {"rotation_rate": 0.01, "translation_rate": 0.01, "final_rate": 1.0}
 POINT_BYTES = {"torch": 95e3, "torch_tuned": 120e3}
 MEMORY_SHARE = 0.8  # usable share of the available memory
 LATENTS, LOSSES, VALUES = 1e-4, 1e-3, 1e-4  # Adam's first steps depend on signs, which rounding changes
+ENERGIES = 1e-4  # between programs that round differently
 SAME = 1e-3, 1.0  # metres and degrees within which two picks are one
 PROBED = 3  # steps from which the 100 of PyTorch as users run it are estimated: all of them would take minutes
 
@@ -37,12 +38,13 @@ class Sizes:
     pitch: float = 0.012  # metres
     batch: tuple[int, int, int] = (8, 256, 1024)  # clouds, points, queries
     track_queries: int = 128
+    targets: int = 16
 
 
 QUICK = Sizes(
     clouds=(60,), num_starts=(2,), poses=3, queries=16, target_starts=2, iterations=4, our_iterations=60,
     grid=3, rotations=2, lattice=(2, 2, 3), batch=(2, 40, 32),
-    track_queries=16,
+    track_queries=16, targets=2,
 )  # fmt: skip
 
 
@@ -51,7 +53,7 @@ def rows(sizes: Sizes) -> list[Row]:
     found = [encoding(points) for points in sizes.clouds]
     found += [step(num_starts, sizes.poses, sizes.queries) for num_starts in sizes.num_starts]
     found += [target(sizes), target(sizes, same_rates=True), sweeping(sizes), training(sizes)]
-    return [*found, tracking(sizes)]
+    return [*found, tracking(sizes), batch(sizes), command()]
 
 
 def select(found: list[Row], names: list[str] | None) -> list[Row]:
@@ -244,6 +246,30 @@ def tracking(sizes: Sizes) -> Row:
     about = {"poses": sizes.poses, "queries": sizes.track_queries}
     title = f"pick on a moved object, tracked and anew by carry, {sizes.poses} x {sizes.track_queries}"
     return Row("track", title, about, arrays, plans, same, 0.0)
+
+
+def batch(sizes: Sizes) -> Row:
+    """Whole calls of `tdf.imitate_batch`: encoding, cleaning, describing, picks and warped paths.
+
+    A call of `tdf.imitate` takes the first time over the number of targets.
+    """
+    targets = sizes.targets
+
+    def arrays():
+        return scene.targets(targets, sizes.poses, sizes.track_queries)
+
+    plans = {"tdf_jax": Plan("imitating", {"chunk": 1}), "tdf_jax_solve": Plan("imitating", {"chunk": targets})}
+    about = {"targets": targets, "poses": sizes.poses, "queries": sizes.track_queries}
+    title = f"imitate on {targets} targets, one after the other and in one program, {sizes.poses} x "
+    title += f"{sizes.track_queries}"
+    return Row("batch", title, about, arrays, plans, agree({"energies": ENERGIES}), 0.0, most=2)
+
+
+def command() -> Row:
+    """`tdf imitate` with default options as a process: without kept programs, and from its second run on."""
+    plans = {"tdf_jax": Plan("command", {"kept": False}), "tdf_jax_solve": Plan("command", {"kept": True})}
+    title = "the command tdf imitate, without compiled programs on disk and with them"
+    return Row("command", title, {}, dict, plans, agree({"energy": ENERGIES}), 0.0, most=3)
 
 
 def training(sizes: Sizes) -> Row:

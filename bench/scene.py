@@ -101,6 +101,24 @@ def motion(poses: int, queries: int) -> dict[str, np.ndarray]:
     return arrays
 
 
+def targets(count: int, poses: int, queries: int) -> dict[str, np.ndarray]:
+    """A demonstration at the handle of a mug, and other mugs in random orientations.
+
+    Args:
+        count: number of the other mugs.
+        poses: number of poses of the trajectory.
+        queries: number of query points.
+
+    Returns:
+        "shown", "path", "query" as `motion`, but with 1500 points; "clouds": (count, 1500, 3), metres.
+    """
+    arrays = motion(poses, queries)
+    turns = Rotation.random(count, random_state=0).as_matrix()
+    clouds = [surface(1 + index, 1500) @ R.T for index, R in enumerate(turns)]
+    arrays |= {"shown": surface(0, 1500), "clouds": np.stack(clouds)}
+    return {name: np.asarray(arrays[name], np.float32) for name in ("shown", "path", "query", "clouds")}
+
+
 def batch(clouds: int, points: int, queries: int) -> dict[str, np.ndarray]:
     """A training batch.
 

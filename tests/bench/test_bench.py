@@ -191,6 +191,8 @@ def test_full_sizes_have_the_rows_and_their_operations():
         "landscape",
         "train",
         "track",
+        "batch",
+        "command",
     ]
 
 

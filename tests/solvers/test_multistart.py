@@ -1,6 +1,7 @@
 """The solver: its quadratic model, what passes from stage to stage, that it finds what `optimize` finds."""
 
 import dataclasses
+import functools
 import operator
 import sys
 
@@ -168,14 +169,14 @@ def descended(field, reference, bounds, tolerance):
     """Energies of 8 poses at the start and after each of 6 steps."""
     problem = solve._problem(KEY, reference, size=8)
     drawn = stages.candidates_of(np, random_starts(KEY, field, reference, 2, "carried", 0.1), problem)
-    _, _, values = gauss_newton.descend(
+    # A program of its own, because tests change a constant of it.
+    program = jax.jit(functools.partial(gauss_newton._steps, length=7, chunk=128, axes=()))
+    _, _, values = program(
         drawn.R.reshape(-1, 3, 3),
         drawn.centroid.reshape(-1, 3),
         np.tile(np.arange(4), 2),
         np.array(bounds, np.int32),
         *(np.float32(0.3), np.float32(tolerance), field, problem, WEIGHTS),
-        length=7,
-        chunk=128,
     )
     return np.asarray(values)
 
@@ -189,11 +190,15 @@ def test_after_half_of_the_steps_only_the_best_poses_go_on(field, reference):
     assert (every[~best, 6] < every[~best, 3]).any()
 
 
-def test_a_pose_that_promises_hardly_anything_leaves(field, reference):
-    """Poses are independent, so one that leaves takes the steps that it takes alone, but for those after its last."""
-    every, some = (descended(field, reference, [8, 8, 1, 6, 8], tolerance) for tolerance in (0.0, 0.1))
+@pytest.mark.slow
+def test_a_pose_that_promises_hardly_anything_leaves(field, reference, monkeypatch):
+    """Poses are independent, so one takes the steps that it takes alone, until it leaves."""
+    every = descended(field, reference, [8, 8, 1, 6, 8], 0.0)
+    monkeypatch.setattr(gauss_newton, "LEAVES", 1.0)
+    some = descended(field, reference, [8, 8, 1, 6, 8], 0.02)
+    # The first step that a pose does not take.
     steps = np.array([np.flatnonzero(one != other)[:1].sum() or 7 for one, other in zip(every, some)])
-    assert steps.min() < 7
+    assert steps.min() < steps.max()
     for one, other, step in zip(every, some, steps):
         np.testing.assert_array_equal(one[:step], other[:step])
         assert (other[step:] == other[step - 1]).all()
