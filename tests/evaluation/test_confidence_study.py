@@ -1,8 +1,11 @@
 """The study of the confidence: what counts as right, the bins, what is kept, and the printed reliability."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from tdf_jax._internal.errors import InputError
 from tdf_jax.evaluation import confidence_study
 from tdf_jax.evaluation.confidence_study import Pick, main, measure, reliability, report
 from tdf_jax.networks.checkpoint import load_model
@@ -42,7 +45,7 @@ def test_the_report_says_what_the_picks_are():
 def test_an_interrupted_study_goes_on(monkeypatch, tmp_path, capsys):
     calls = []
 
-    def measured(model, category, place, seed, number):
+    def measured(model, category, place, seed, number, hidden):
         calls.append(number)
         if number == 3 and len(calls) < 5:
             raise KeyboardInterrupt
@@ -62,6 +65,34 @@ def test_an_interrupted_study_goes_on(monkeypatch, tmp_path, capsys):
     with pytest.raises(SystemExit):  # too few of a kind
         main(["--picks", "4", "--seed", "3", "--out", str(tmp_path), "--fit"])
     assert "a fit needs 10 of each" in capsys.readouterr().err
+
+
+def test_hidden_places_have_a_report_of_their_own(monkeypatch, tmp_path, capsys):
+    def measured(model, category, place, seed, number, hidden):
+        return Pick("camera1", 0.9, 0.1, 90.0, 3.0) if hidden else Pick("full", 0.1, 0.001, 5.0, np.nan)
+
+    monkeypatch.setattr(confidence_study, "measure", measured)
+    monkeypatch.setattr(confidence_study, "load_model", lambda name: name)
+    monkeypatch.setattr(confidence_study, "fingerprint", lambda model: model)
+    main(["--picks", "5", "--hidden", "2", "--out", str(tmp_path)])
+    every, hidden = capsys.readouterr().out.split("places that one depth image hides")
+    assert "picks: 5, of which 0 found nothing; right: 100 %" in every and "place hidden" not in every
+    assert "picks: 2, of which 0 found nothing; right: 0 %" in hidden
+    assert "place hidden, wrong: 2 picks, confidence below 0.5 in 100 %" in hidden
+
+
+def test_the_first_pair_whose_place_is_hidden_is_taken(monkeypatch):
+    asked = []
+
+    def made(category, seed, index, *, place, clouds, natural):
+        asked.append(index)
+        return SimpleNamespace(seen=3 if index == 203 else 50, clouds=clouds)
+
+    monkeypatch.setattr(confidence_study, "generated_case", made)
+    case, number = confidence_study._hidden_case("mug", "handle", 0, 2)
+    assert number == 203 and case.seen == 3 and asked == [200, 201, 202, 203]
+    with pytest.raises(InputError, match="none of 100 depth images hides the rim of a bowl"):
+        confidence_study._hidden_case("bowl", "rim", 0, 0)
 
 
 def test_picks_that_find_nothing_end_in_a_line(monkeypatch, tmp_path, capsys):
