@@ -1,1 +1,1 @@
-"""Time and memory: `python -m bench` against PyTorch, `python -m bench.landscape` of landscapes alone."""
+"""Time and memory: `python -m bench` against PyTorch, `bench.landscape` of landscapes, `bench.viewer` of `tdf view`."""

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import functools
 import gzip
+import importlib.util
 import io
 import json
 import os
@@ -260,9 +261,6 @@ def compilations():
 
 # Pages and the viewer in a browser.
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-SOFTWARE = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
-
 
 def page_content(page):
     """What a page of `write_page` draws: data, layout and, if something moves, its frames."""
@@ -277,19 +275,30 @@ def _no_browser(why):
 
 
 @pytest.fixture(scope="module")
-def browser():
-    """Chromium without a window, which draws on the processor."""
-    found = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if found is None:
-        _no_browser(f"none of {', '.join(BROWSERS)} is installed (Debian: apt install chromium)")
+def chromium():
+    """Program of the browser; playwright is installed, too."""
+    from bench.browser import browser_program
+
     try:
-        from playwright.sync_api import sync_playwright
-    except ImportError:
+        found = browser_program("tests")
+    except tdf.InputError as error:
+        _no_browser(str(error))
+    if importlib.util.find_spec("playwright") is None:
         _no_browser("playwright is not installed (pip install playwright)")
+    return found
+
+
+@pytest.fixture(scope="module")
+def browser(chromium):
+    """Chromium without a window, which draws on the processor."""
+    from playwright.sync_api import sync_playwright
+
+    from bench.browser import SOFTWARE
+
     with sync_playwright() as driver:
-        chromium = driver.chromium.launch(executable_path=found, args=list(SOFTWARE))
-        yield chromium
-        chromium.close()
+        started = driver.chromium.launch(executable_path=chromium, args=list(SOFTWARE))
+        yield started
+        started.close()
 
 
 def opened(browser, page):
@@ -308,15 +317,6 @@ def colours_of(png):
     from PIL import Image
 
     return len(np.unique(np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).reshape(-1, 3), axis=0))
-
-
-def on_screen(server, xyz):
-    """Where a point of the world is in the browser that is connected to a viewer, pixels."""
-    (client,) = server.get_clients().values()
-    camera = client.camera
-    x, y, z = Rotation.from_quat(camera.wxyz, scalar_first=True).inv().apply(np.asarray(xyz) - camera.position)
-    scale = camera.image_height / 2 / np.tan(camera.fov / 2)
-    return camera.image_width / 2 + scale * x / z, camera.image_height / 2 + scale * y / z
 
 
 # The robot in physics, and what its tests share.

@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import on_screen, random_cloud, random_poses
+from conftest import random_cloud, random_poses
 
 import tdf_jax as tdf
+from bench.browser import on_screen
 from tdf_jax._internal.errors import InputError
 from tdf_jax.geometry import se3
 from tdf_jax.viewer import demonstrating

@@ -6,10 +6,11 @@ import time
 import jax
 import numpy as np
 import pytest
-from conftest import CARRY, colours_of, on_screen, random_cloud
+from conftest import CARRY, colours_of, random_cloud
 from scipy.spatial.transform import Rotation
 
 import tdf_jax as tdf
+from bench.browser import on_screen
 from tdf_jax.geometry.grid import plane_grid, volume_grid
 from tdf_jax.landscape.storage import Landscape
 from tdf_jax.viewer import energies, handles, solving, stage
