@@ -58,7 +58,7 @@ class SolveConfig:
     """Settings of `solve`.
 
     Attributes:
-        num_starts: number of random starts of the keyframe.
+        num_starts: number of random starts of the keyframe. The worse half takes half of the coarse steps only.
         num_trajectory_starts: number of random starts of the whole trajectory, which the search stage takes; they are
             the first of all starts.
         num_candidates: number of distinct candidates of each waypoint that are refined and polished.
@@ -69,7 +69,8 @@ class SolveConfig:
         propagate_steps: maximal number of steps of the propagate stage.
         refine_steps: maximal number of steps of the refine stage.
         polish_steps: maximal number of steps of the polish stage.
-        tolerance: a stage ends when no pose's next step promises to lower its energy by more than this share of it.
+        tolerance: a stage ends when no pose's next step promises to lower its energy by more than this share of it. A
+            pose that promises less than a hundredth of that takes no further step.
         start: distribution of the starts, see `OptimizeConfig`.
         start_radius: radius of the starts, metres, see `OptimizeConfig`.
         chunk_queries: number of query points that are evaluated at a time; None chooses. It changes speed and memory,

@@ -42,7 +42,7 @@ class CarryConfig:
     """Settings of `carry`: those of the solver that finds the pick.
 
     Attributes:
-        num_starts: number of random starts of the pick.
+        num_starts: number of random starts of the pick. The worse half takes half of the coarse steps only.
         num_candidates: number of candidates that are refined and polished, the rows of the result. Several may converge
             to one pose, see `cluster_poses`.
         num_coarse_queries: number of query points that all stages but the last evaluate, drawn at random.
