@@ -172,7 +172,7 @@ def summary(
 def _rates(predicted: np.ndarray, right: np.ndarray) -> dict:
     return {
         str(level): {
-            "wrong_noticed": float(np.mean(predicted[right == 0] < level)),
+            "wrong_doubted": float(np.mean(predicted[right == 0] < level)),
             "right_doubted": float(np.mean(predicted[right == 1] < level)),
         }
         for level in LEVELS

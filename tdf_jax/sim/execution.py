@@ -17,7 +17,7 @@ SLOW = 0.01  # rad/s, below which a joint's friction is compensated in part: its
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Payload:
-    """What a controller is told of what the hand will hold.
+    """Mass and centre of mass of the object that the hand will hold, for the controller.
 
     Attributes:
         mass: mass, kg.
@@ -35,7 +35,7 @@ class Controller:
     The command of a position actuator is the planned position, with what it takes to keep up: the damping times the
     planned velocity, the joints' friction and the arm's inertia times the planned acceleration, over the actuator's
     stiffness. Without it the UR5e's model, by its damping over its stiffness, would be 0.2 s behind. Gravity on the arm
-    itself is compensated (`tdf_jax.sim.robot`), that on what it holds only if the controller is told of it.
+    itself is compensated (`tdf_jax.sim.robot`), that on what it holds only if the controller has a payload.
 
     Attributes:
         cell: the cell, with the arm.
@@ -127,7 +127,7 @@ def execute(
         data: its state, which changes.
         motion: the trajectory.
         watch: called after every step with the state, the number of the step and the phase.
-        payload: what the controller is told of what the hand will hold.
+        payload: mass and centre of mass of the object that the hand will hold, whose weight is then compensated.
     """
     mujoco = extra("execute()", "mujoco")
     controller = Controller(cell, motion, payload)

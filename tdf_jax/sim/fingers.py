@@ -35,7 +35,7 @@ class Fingers:
         depths: middle of the pads along the approach from the site, (commands,), metres. The pads of the 2F-85 move
             along the approach as it closes.
         tips: tips of the pads along the approach from the site, (commands,), metres.
-        forces: force of each pad on what keeps the fingers that far open when they are told to close, (commands,),
+        forces: force of each pad on what keeps the fingers that far open when closing is commanded, (commands,),
             newtons.
         joints: names of the fingers' joints.
         positions: their positions, (commands, joints), radians or metres.
@@ -59,7 +59,7 @@ class Fingers:
         return float(np.interp(opening, self.openings[::-1], self.commands[::-1]))
 
     def force(self, opening: float) -> float:
-        """Force of each pad on what keeps the fingers open to an opening, metres, when they are told to close."""
+        """Force of each pad on what keeps the fingers open to an opening, metres, when closing is commanded."""
         return float(np.interp(opening, self.openings[::-1], self.forces[::-1]))
 
     def joint_positions(self, opening: float) -> Float[np.ndarray, " joints"]:

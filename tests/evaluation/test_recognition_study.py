@@ -30,7 +30,7 @@ def test_the_record_has_rates_and_areas(evidence, tmp_path, capsys):
     kept = json.loads((tmp_path / "record.json").read_text())
     assert json.loads(printed[printed.index("{") :]) == kept
     assert len(evidence) == kept["cases"] == 16 and {case[:2] for case in evidence} == {("mug", 3)}
-    assert kept["thresholds"]["0.5"] == {"wrong_noticed": 0.75, "right_doubted": 0.0}
+    assert kept["thresholds"]["0.5"] == {"wrong_doubted": 0.75, "right_doubted": 0.0}
     assert kept["area"] == kept["area_of_the_residual_alone"] == pytest.approx(0.75 + 0.25 / 2)
     assert kept["area_by_cloud"] == {"full": 1.0, "views1": 1.0, "views2": 1.0, "noise": 0.5}
     assert set(kept["thresholds_by_size"]) == {"common", "natural"} and kept["curve"] == [-2.77, 6.25, 4.76]
@@ -40,7 +40,7 @@ def test_a_fit_separates_what_it_was_fitted_to(evidence, tmp_path):
     study.main(["--count", "8", "--fit", "--out", str(tmp_path / "record.json")])
     kept = json.loads((tmp_path / "record.json").read_text())
     assert kept["curve"] != [-2.77, 6.25, 4.76] and np.isfinite(kept["curve"]).all()
-    assert kept["thresholds"]["0.5"] == {"wrong_noticed": 0.75, "right_doubted": 0.0}
+    assert kept["thresholds"]["0.5"] == {"wrong_doubted": 0.75, "right_doubted": 0.0}
 
 
 @pytest.mark.parametrize(
