@@ -42,8 +42,9 @@ def shapes(
     family = FAMILIES[category]
     real = [] if meshes is None else [one for one in load_annotated(meshes, recursive) if one.category == category]
     generated = [family.build(family.sample(np.random.default_rng([seed, index]))) for index in range(count)]
-    named = [(FOLDS[one.fold], one.mesh) for one in generated] + [
-        (f"{one.name}\n{FOLDS[one.fold]}", one.mesh) for one in real
+    fold = FOLDS | {1: ""}  # no symmetry needs no word
+    named = [(fold[one.fold], one.mesh) for one in generated] + [
+        (f"{one.name}\n{fold[one.fold]}".strip(), one.mesh) for one in real
     ]
     pictures = Pictures("tdf shapes")
     with pictures.drawing(out):

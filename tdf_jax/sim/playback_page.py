@@ -16,7 +16,7 @@ from tdf_jax.viz.style import CENTIMETRES, COLOURS, INK, VIEW
 EVERY = 2  # of the frames that are kept, one is on the page
 MOST_FRAMES = 400
 LOWEST = -0.2  # metres, below which nothing is shown: an object may fall from the table
-DISTANCE = 1.95  # of the camera, in the size of the scene
+DISTANCE = 2.15  # of the camera, in the size of the scene
 
 
 def save_playback_page(path: str | os.PathLike, playback: Playback) -> None:

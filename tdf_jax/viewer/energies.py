@@ -10,7 +10,7 @@ from tdf_jax.landscape.storage import Landscape
 from tdf_jax.viewer import handles
 from tdf_jax.viewer.solving import Problem
 from tdf_jax.viz.landscapes import LEVELS, SURFACES, isosurface
-from tdf_jax.viz.style import CLOUD, TRUTH
+from tdf_jax.viz.style import PALE, TRUTH
 
 NEAR = 0.02  # metres between the first waypoints of an imitation and its landscape, whose clouds may be other samples
 
@@ -52,7 +52,7 @@ def show_landscape(server: Any, landscape: Landscape) -> None:
     low, high = float(np.nanmin(energy)), float(np.nanmax(energy))
     marks = {
         "demonstration, moved with the centroid": handles.add_path(
-            server, "/landscape/waypoints", landscape.waypoints, CLOUD
+            server, "/landscape/waypoints", landscape.waypoints, PALE, 2 * handles.LINE
         ),
         "minimum of each waypoint": handles.add_crosses(server, "/landscape/minimisers", landscape.minimisers, TRUTH),
     }
@@ -65,7 +65,10 @@ def show_landscape(server: Any, landscape: Landscape) -> None:
         nodes["slice"] = plane
 
     with gui.add_folder("Landscape"):
-        gui.add_markdown(f"Energy from {low:.4f} (dark) to {high:.4f} (light); red: the minimum of each waypoint.")
+        gui.add_markdown(
+            f"Energy from {low:.4f} (dark) to {high:.4f} (light); red: the minimum of each waypoint; "
+            "grey: the demonstration, moved with the centroid."
+        )
         if energy.ndim == 2:
             nodes["slice"] = handles.add_map(server, "/landscape/slice", points, energy, (low, high))
         else:

@@ -110,7 +110,7 @@ def path_segments(xyz: Float[np.ndarray, "poses 3"]) -> Float[np.ndarray, "segme
     return np.stack([xyz[:-1], xyz[1:]], axis=1)
 
 
-def add_path(server: Any, name: str, xyz: Float[np.ndarray, "poses 3"], colour: Any) -> Any:
+def add_path(server: Any, name: str, xyz: Float[np.ndarray, "poses 3"], colour: Any, thickness: float = LINE) -> Any:
     """Add the path of the query frame's origin.
 
     Args:
@@ -118,8 +118,9 @@ def add_path(server: Any, name: str, xyz: Float[np.ndarray, "poses 3"], colour: 
         name: name of the node.
         xyz: positions, (poses, 3).
         colour: its colour.
+        thickness: thickness of its lines, metres.
     """
-    return server.scene.add_line_segments(name, path_segments(np.asarray(xyz)), rgb(colour), thickness=LINE)
+    return server.scene.add_line_segments(name, path_segments(np.asarray(xyz)), rgb(colour), thickness=thickness)
 
 
 def add_crosses(server: Any, name: str, xyz: Float[np.ndarray, "points 3"], colour: Any) -> Any:

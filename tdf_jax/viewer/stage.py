@@ -17,6 +17,7 @@ from tdf_jax.viewer.solving import Problem, Solution
 from tdf_jax.viewer.worker import Worker
 from tdf_jax.viz.imitation_page import above
 from tdf_jax.viz.motion import motion_of
+from tdf_jax.viz.scene3d import shown_boxes
 from tdf_jax.viz.style import CLOUD, COLOURS, CONTACT, ESTIMATE, INK, MARKED, TRUTH, VIEW
 
 STEP = 0.1  # of the time slider, poses
@@ -44,6 +45,7 @@ class Stage:
         self.solution = solving.chosen(problem, 0)
         self.worker = Worker(self._say)
         self._centroid = np.asarray(problem.points, float).mean(axis=0)
+        self._swept = np.zeros((0, 3)) if landscape is None else landscape.grid.points.reshape(-1, 3)
         self._draw()
         self._panel(landscape)
         self._show(self.solution)
@@ -82,6 +84,7 @@ class Stage:
         self._path = handles.add_path(server, "/imitation/path", self.solution.path[:, 4:], INK)
         self._box = handles.add_box(server, "/imitation/box", demonstration.query, BOX, 1.6 * handles.LINE)
         self._boxes: list[Any] = []
+        self._boxed = np.zeros(0, int)  # poses that have a box
         self._picks: list[Any] = []
         self._visible: dict[str, bool] = {}  # what is switched, by its name
         self._fit(len(self.solution.path))
@@ -117,9 +120,10 @@ class Stage:
         self._look()
 
     def _fit(self, poses: int) -> None:
-        """Have as many boxes along the path as it has poses."""
-        if len(self._boxes) == poses:
+        """Have the boxes of a path with that many poses; of a long one some, which hide less."""
+        if self._boxed.size and self._boxed[-1] == poses - 1:
             return
+        self._boxed = shown_boxes(poses)
         visible = all(node.visible for node in self._boxes)
         for node in self._boxes:
             node.remove()
@@ -128,7 +132,7 @@ class Stage:
             handles.add_box(
                 self.server, f"/imitation/boxes/{i}", query, COLOURS(i / max(1, poses - 1)), 0.5 * handles.LINE
             )
-            for i in range(poses)
+            for i in self._boxed
         ]
         for node in self._boxes:
             node.visible = visible
@@ -189,7 +193,7 @@ class Stage:
         gap = 0.3 * self._size()
         self._beside = right * ((contents @ right).min() - (shown @ right).max() - gap)
         self._beside = self._beside + [0, 0, contents[:, 2].min() - shown[:, 2].min()]
-        handles.look(self.server, np.concatenate([contents, shown + self._beside]))
+        handles.look(self.server, np.concatenate([contents, shown + self._beside, self._swept]))
 
     def _add_surface(self) -> None:
         try:
@@ -355,7 +359,7 @@ class Stage:
             self._path.points = handles.path_segments(solution.path[:, 4:]).astype(np.float32)
             self._fit(len(solution.path))
             self.player.extend(len(solution.path) - 1)
-            for node, pose in zip(self._boxes, solution.path, strict=True):
+            for node, pose in zip(self._boxes, solution.path[self._boxed], strict=True):
                 handles.place(node, pose[:4], pose[4:])
             if goal:
                 handles.place(self._goal, solution.goal[:4], solution.goal[4:])
@@ -406,6 +410,6 @@ def _table(problem: Problem) -> str:
         rows.append(f"| {' | '.join([str(number), f'{energy:.5f}', *both, behind])} |")
     listed = f" (the first {SHOWN_MODES} are listed)" if len(modes) > SHOWN_MODES else ""
     candidates = len(problem.scene.result.energies)
-    words = f"{len(modes)} distinct of {candidates} candidates{listed}"
+    words = f"{len(modes)} distinct of {candidates} candidate{'s' * (candidates != 1)}{listed}"
     words += "; dark boxes have low energies." if len(modes) > 1 else ": there is no second-best pick."
     return "\n".join([*rows, "", words])

@@ -52,7 +52,7 @@ def figure4(runs: dict[tuple, Run], scenes: dict[tuple, Scene]) -> Figure:
     views = []
     for (shape, displacement), run in runs.items():
         scene = scenes[shape, displacement]
-        title = shape if not any(displacement) else f"{shape}, endpoint + {vector(displacement)}"
+        title = shape if not any(displacement) else f"{shape}, endpoint + {vector(displacement)} m"
         views.append(
             (
                 title,
