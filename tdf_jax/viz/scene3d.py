@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 WIDTH = 7.2  # width of a page's text, inches
 SHOWN_POINTS = 1500  # points of a cloud; more points overlap at the width of a page
 TICKS, LABEL = 4, -1.2  # intervals between ticks on the longest axis, and points between ticks and the axis's name
+NEAR_LABEL = -6  # the same in narrow panels, whose neighbours would hide the names of z
 MOST_BOXES = 8  # along a path: more would hide the object
 MARGIN = 1.06  # length of the axes, in that of their contents
 MOST_TRIANGLES = 40_000  # a mesh with more triangles is drawn as points, because matplotlib would take seconds
@@ -140,18 +141,21 @@ def draw(axes: Axes3D, view: View, box: Float[np.ndarray, "8 3"]) -> None:
     axes.plot(*path.T, color=INK, zorder=6, label="trajectory of the query frame", **line)
 
 
-def frame(axes: Axes3D, content: Float[np.ndarray, "points 3"], size: Float[np.ndarray, "3"]) -> None:
+def frame(
+    axes: Axes3D, content: Float[np.ndarray, "points 3"], size: Float[np.ndarray, "3"], label: float = LABEL
+) -> None:
     """Set equal scales on all axes, and few ticks, so that they do not touch.
 
     Args:
         axes: the axes.
         content: points in the middle of the axes, (points, 3), metres.
         size: lengths of the axes, (3,), metres; those of several panels are equal.
+        label: distance of the names of the axes from the ticks, points.
     """
     centre = (content.min(axis=0) + content.max(axis=0)) / 2
     for name, middle, length in zip("xyz", CENTIMETRES * centre, CENTIMETRES * size):
         getattr(axes, f"set_{name}lim")(middle - length / 2, middle + length / 2)
-        getattr(axes, f"set_{name}label")(f"{name} (cm)", labelpad=LABEL)
+        getattr(axes, f"set_{name}label")(f"{name} (cm)", labelpad=label)
         axis = getattr(axes, f"{name}axis")
         axis.set_major_locator(MaxNLocator(round(1 + (TICKS - 1) * length / max(CENTIMETRES * size))))
         axis.set_pane_color((0.97, 0.97, 0.97))
@@ -187,7 +191,7 @@ def panels(
             bottom = foot + tall * (rows - 1 - row + (0.93 - share) / 2)
             axes = add_axes3d(figure, ((column + 0.07) / columns, bottom, 0.83 / columns, share * tall))
             draw(axes, view, box)
-            frame(axes, contents[index], size)
+            frame(axes, contents[index], size, LABEL if columns < 3 else NEAR_LABEL)
             axes.set_title(title, y=1.0, fontsize=8)
             legend |= legend_of(axes)
         waypoint_bar(figure, num_poses, (0.62, 0.42 / height, 0.3, 0.1 / height))

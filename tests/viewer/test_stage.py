@@ -1,5 +1,6 @@
 """The viewer: what it shows and does without a browser, and with one, by a mouse."""
 
+import dataclasses
 import threading
 import time
 
@@ -97,6 +98,27 @@ def test_an_object_that_is_dragged_is_solved_again(shown, problem):
     x, y, z = 100 * shown.solution.pick[4:]
     assert f"x {x:.1f}, y {y:.1f}, z {z:.1f} cm" in shown._summary.content
     np.testing.assert_allclose(shown._path.points[0, 0], shown.solution.path[0, 4:], atol=1e-6)
+
+
+def test_a_long_path_has_eight_boxes_from_its_first_pose_to_its_last(shown, problem):
+    path = np.repeat(shown.solution.path[:1], 30, axis=0)
+    path[:, 4] += np.linspace(0, 1, 30)
+    shown._show(dataclasses.replace(shown.solution, path=path))
+    xyz = np.array([box.position for box in shown._boxes])
+    assert len(xyz) == 8 and shown.player.slider.max == 29
+    np.testing.assert_allclose(xyz[[0, -1]], path[[0, -1], 4:], atol=1e-6)
+    assert np.diff(xyz[:, 0]).min() > 0.1
+
+
+def test_a_landscape_with_an_imitation_is_in_view(problem, monkeypatch):
+    looked = []
+    monkeypatch.setattr(stage.handles, "look", lambda server, contents: looked.append(contents))
+    grid = plane_grid(0.7, 3, problem.points.mean(axis=0))
+    with serving("test", 0) as server:
+        stage.Stage(server, problem, bowl(grid)).close()
+    (contents,) = looked
+    assert (contents.min(axis=0) <= grid.points.reshape(-1, 3).min(axis=0) + 1e-9).all()
+    assert (contents.max(axis=0) >= grid.points.reshape(-1, 3).max(axis=0) - 1e-9).all()
 
 
 def test_a_goal_that_is_dragged_takes_the_path_along(shown):
