@@ -28,6 +28,7 @@ HEIGHT = 7.2  # inches
 TITLE = 95  # characters of a line of the title
 SIZE = 2.4  # of a square point, typographic points squared
 ZOOM = 1.03, 0.93  # of the overviews, whose long boxes leave room, and of the close-ups
+LABEL = -3.5  # points between ticks and the names of axes, which otherwise meet titles and the legend
 CLOSE_UPS = {
     "demonstration": "demonstration, at the release",
     "imitation": "imitation, at the release, rotated as demonstrated",
@@ -138,7 +139,7 @@ def _row(figure: Figure, sides: dict[str, _Side], band: tuple[float, float], box
         _draw(axes, side, box)
         # A way of a metre between objects of a decimetre: each overview has a scale of its own, as large as possible.
         size = size if box is not None else np.max(sizes, axis=0)
-        frame(axes, content, size)
+        frame(axes, content, size, LABEL)
         set_view(axes, tuple(size), ZOOM[0] if box is not None else ZOOM[1], VIEW)
         words = name if box is not None else CLOSE_UPS[name]
         figure.text(0.5 * column + 0.24, band[0] + band[1] + 0.005, words, ha="center", va="bottom", fontsize=9)

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
 from tdf_jax.viz.scene3d import WIDTH
-from tdf_jax.viz.style import ESTIMATE, INK, PALE, STYLE, TRUTH, blank_figure
+from tdf_jax.viz.style import ESTIMATE, INK, PALE, STYLE, TRUTH, blank_figure, legend_of
 
 PANELS = (
     ("bce", "occupancy: binary cross-entropy", "log"),
@@ -47,8 +47,8 @@ def training_figure(rows: Sequence[dict]) -> Figure:
         transfer = axes[0, 1].plot(
             *np.array(shares).reshape(-1, 2).T, color=ESTIMATE, ls="--", marker="o", ms=2.5, lw=1
         )
-        axes[0, 0].legend(frameon=False)
-        axes[0, 1].legend(transfer, ["transfers within 2 cm and 20°"], frameon=False)
+        legend = legend_of(axes[0, 0]) | {"transfers within 2 cm and 20°": transfer[0]}
+        figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=2, frameon=False)
         for panel in axes[1]:
             panel.set_xlabel("step")
     return figure
