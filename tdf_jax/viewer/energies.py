@@ -36,12 +36,13 @@ def check_landscape_of(problem: Problem, landscape: Landscape, folder: Path) -> 
         )
 
 
-def show_landscape(server: Any, landscape: Landscape) -> None:
+def show_landscape(server: Any, landscape: Landscape, opacity: float = 1.0) -> None:
     """Add an energy landscape: a plane, or the slices and the surfaces of a volume, with its waypoints and minimisers.
 
     Args:
         server: the `viser.ViserServer`.
         landscape: landscape of a grid with two or three axes, in one orientation or the best of several.
+        opacity: of the plane, from 0 to 1.
     """
     energy, points, gui = landscape.combined, landscape.grid.points, server.gui
     if energy.ndim not in (2, 3) or energy.shape != landscape.grid.shape:
@@ -60,7 +61,8 @@ def show_landscape(server: Any, landscape: Landscape) -> None:
 
     def slice_at(number: int) -> None:
         visible = nodes["slice"].visible if nodes else True
-        plane = handles.add_map(server, "/landscape/slice", points[..., number, :], energy[..., number], (low, high))
+        where, values = points[..., number, :], energy[..., number]
+        plane = handles.add_map(server, "/landscape/slice", where, values, (low, high), opacity)
         plane.visible = visible
         nodes["slice"] = plane
 
@@ -70,7 +72,7 @@ def show_landscape(server: Any, landscape: Landscape) -> None:
             "grey: the demonstration, moved with the centroid."
         )
         if energy.ndim == 2:
-            nodes["slice"] = handles.add_map(server, "/landscape/slice", points, energy, (low, high))
+            nodes["slice"] = handles.add_map(server, "/landscape/slice", points, energy, (low, high), opacity)
         else:
             count = energy.shape[2]
             chosen = gui.add_slider("slice", 0, count - 1, 1, count // 2)

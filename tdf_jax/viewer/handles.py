@@ -143,6 +143,7 @@ def add_map(
     points: Float[np.ndarray, "rows columns 3"],
     energies: Float[np.ndarray, "rows columns"],
     limits: tuple[float, float],
+    opacity: float = 1.0,
 ) -> Any:
     """Add a plane of a landscape, coloured by its energies; points without an energy are left out.
 
@@ -152,8 +153,11 @@ def add_map(
         points: points of the plane, (rows, columns, 3).
         energies: their energies, (rows, columns).
         limits: lowest and highest energy of the colours.
+        opacity: from 0 to 1; below 1 what is behind the plane shows through.
     """
     import trimesh
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
 
     rows, columns = energies.shape
     first = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
@@ -169,7 +173,16 @@ def add_map(
     share = np.nan_to_num((flat - low) / max(high - low, 1e-12))
     colours = (255 * COLOURS(share)).astype(np.uint8)
     both = np.concatenate([faces, faces[:, ::-1]])  # the plane is seen from both sides
-    mesh = trimesh.Trimesh(points.reshape(-1, 3), both, vertex_colors=colours, process=False)
+    # Colours of vertices alone have no material, and without one viser draws them as opaque metal.
+    material = PBRMaterial(
+        baseColorFactor=(255, 255, 255, round(255 * opacity)),
+        metallicFactor=0.0,
+        roughnessFactor=1.0,
+        alphaMode="OPAQUE" if opacity == 1 else "BLEND",
+    )
+    look = TextureVisuals(material=material)
+    look.vertex_attributes["color"] = colours
+    mesh = trimesh.Trimesh(points.reshape(-1, 3), both, visual=look, process=False)
     return server.scene.add_mesh_trimesh(name, mesh, cast_shadow=False, receive_shadow=False)
 
 

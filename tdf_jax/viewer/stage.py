@@ -28,6 +28,7 @@ REACH = 0.006  # metres from the ray of a click within which a point is hit
 SHOWN_MODES = 12
 SURFACE_NAME, CONTACT_NAME, OTHERS = "reconstructed surface", "contact regions", "other picks"
 PAINTING = 2.0  # seconds from a browser's connection to when it has painted
+PLANE = 0.6  # opacity of a landscape's plane: the object and the path are behind it
 GRIP = 0.5  # length of the arrows at the object, in its diagonal
 
 
@@ -252,7 +253,7 @@ class Stage:
         where.on_update(lambda event: self._put_demonstration(event.target.value))
         self._put_demonstration(BESIDE)
         if landscape is not None:
-            show_landscape(self.server, landscape)
+            show_landscape(self.server, landscape, PLANE)
 
     def _add_switch(self, name: str, value: bool) -> None:
         switch = self.server.gui.add_checkbox(name, value)
@@ -317,6 +318,7 @@ class Stage:
             self._show(solving.chosen(self.problem, number))
             with self.server.atomic():
                 self._part_picks(number)
+            self._say(f"Pick {number + 1} of the folder.")
 
         self.worker.ask("choose", choose)
 

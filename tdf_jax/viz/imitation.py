@@ -64,20 +64,18 @@ def imitation_figure(
     return figure
 
 
-def loss_figure(
-    losses: Float[np.ndarray, "starts iterations"], best: int, title: str = "", rows: str = "start"
-) -> Figure:
-    """Loss against iteration of every start, as in figure 5 of the paper.
+def loss_figure(losses: Float[np.ndarray, "rows steps"], best: int, title: str = "", rows: str = "start") -> Figure:
+    """Loss against the steps of every start, as in figure 5 of the paper.
 
     Args:
-        losses: energies, (starts, iterations); the curve of a start ends where it becomes non-finite.
-        best: number of the start that is drawn bold.
+        losses: energies, (rows, steps); the curve of a row ends where it becomes non-finite.
+        best: number of the row that is drawn bold.
         title: title above the axes.
         rows: name of a row in the legend; the rows of the solver are candidates.
     """
     with matplotlib.rc_context(STYLE):
         figure = blank_figure(4.8, 3.2, layout="constrained")
         axes = figure.add_subplot()
-        losses_panel(axes, losses, best, rows, "iteration")
+        losses_panel(axes, losses, best, rows)
         axes.set_title(title)
     return figure

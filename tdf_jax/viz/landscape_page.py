@@ -96,7 +96,7 @@ def landscape_page(function: str, landscape: Landscape, marks: Marks, title: str
     shown = np.concatenate([points.reshape(-1, 3), CENTIMETRES * np.asarray(content), *lines])
     margin = 0.03 * np.ptp(shown, axis=0)  # plotly cuts what lies on the end of an axis
     scene = scene_axes(shown.min(axis=0) - margin, shown.max(axis=0) + margin) | {"camera": camera(VIEW, DISTANCE)}
-    legend = {"x": 0, "y": 1, "bgcolor": "rgba(255,255,255,0.6)"}
+    legend = {"orientation": "h", "x": 0, "y": 0, "yanchor": "top", "itemsizing": "constant"}
     font = {"color": INK, "size": 13}
     figure.update_layout(scene=scene, legend=legend, font=font, margin={"l": 0, "r": 0, "b": 0, "t": 0})
     return page_of(function, figure, title)

@@ -133,9 +133,7 @@ def candidates_panel(
     bar.update_ticks()
 
 
-def losses_panel(
-    ax: Axes, losses: Float[np.ndarray, "rows steps"], best: int, rows: str = "candidate", steps_are: str = "step"
-) -> None:
+def losses_panel(ax: Axes, losses: Float[np.ndarray, "rows steps"], best: int, rows: str = "candidate") -> None:
     """Draw the loss of every candidate against the steps, the best bold.
 
     Args:
@@ -143,7 +141,6 @@ def losses_panel(
         losses: energies, (rows, steps); a curve ends where it becomes non-finite.
         best: number of the best row.
         rows: what a row is, for the legend.
-        steps_are: what a column is, for the axis.
     """
     losses = np.asarray(losses)
     steps = np.arange(losses.shape[1])
@@ -153,7 +150,7 @@ def losses_panel(
     ax.plot(steps, losses[best], color=COLOURS(0.35), lw=2.0, label=f"best, {rows} {best + 1} of {len(losses)}")
     legend = legend_of(ax)
     ax.legend(legend.values(), legend.keys(), frameon=False)
-    ax.set(xlabel=steps_are, ylabel="loss (no unit)", xlim=(0, max(1, steps[-1])))
+    ax.set(xlabel="step", ylabel="loss (no unit)", xlim=(0, max(1, steps[-1])))
     ax.set_ylim(bottom=0)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.spines[["top", "right"]].set_visible(False)

@@ -116,6 +116,8 @@ def test_a_landscape_with_an_imitation_is_in_view(problem, monkeypatch):
     grid = plane_grid(0.7, 3, problem.points.mean(axis=0))
     with serving("test", 0) as server:
         stage.Stage(server, problem, bowl(grid)).close()
+        plane = server.scene._handle_from_node_name["/landscape/slice"]
+        assert b'"alphaMode":"BLEND"' in plane.glb_data  # the object behind it shows through
     (contents,) = looked
     assert (contents.min(axis=0) <= grid.points.reshape(-1, 3).min(axis=0) + 1e-9).all()
     assert (contents.max(axis=0) >= grid.points.reshape(-1, 3).max(axis=0) - 1e-9).all()
@@ -245,6 +247,7 @@ def test_another_pick_is_shown_and_the_result_comes_back(shown, problem):
     np.testing.assert_array_equal(shown.solution.pick, problem.modes[number].pose)
     np.testing.assert_array_equal(shown._grip.position, shown._centroid)
     np.testing.assert_array_equal(shown.solution.motion, solving.IDENTITY)
+    assert shown._status.content == f"Pick {number + 1} of the folder."  # and no longer that of the drag
 
 
 def test_the_chosen_pick_is_drawn_once_and_all_others_beside_it(shown, problem):
@@ -306,6 +309,8 @@ def test_a_narrow_window_has_all_in_it(aspect, problem):
 def test_a_landscape_is_shown_in_slices(grid):
     with serving("test", 0) as server:
         energies.show_landscape(server, bowl(grid))
+        plane = server.scene._handle_from_node_name["/landscape/slice"]
+        assert b'"alphaMode":"OPAQUE"' in plane.glb_data
         names = set(server.scene._handle_from_node_name)
         assert {"/landscape/slice", "/landscape/waypoints", "/landscape/minimisers"} <= names
         inputs = server.gui._gui_input_handle_from_uuid.values()

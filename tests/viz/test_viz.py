@@ -118,7 +118,7 @@ def test_every_start_is_a_line_and_the_best_is_bold():
     np.testing.assert_array_equal(drawn, losses[[0, 2, 1]])
     assert [line.get_linewidth() > 1 for line in axes.lines] == [False, False, True]
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["other starts", "best, start 2 of 3"]
-    assert (axes.get_xlabel(), axes.get_xlim(), axes.get_ylim()[0]) == ("iteration", (0, 2), 0)
+    assert (axes.get_xlabel(), axes.get_xlim(), axes.get_ylim()[0]) == ("step", (0, 2), 0)
     assert "loss" in axes.get_ylabel()
 
 
