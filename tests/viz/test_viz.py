@@ -123,10 +123,10 @@ def test_every_start_is_a_line_and_the_best_is_bold():
 
 
 def test_a_figure_is_saved_without_touching_global_state(tmp_path):
-    before = dict(matplotlib.rcParams)
+    before, open_before = dict(matplotlib.rcParams), matplotlib.pyplot.get_fignums()
     save_figure(tmp_path / "loss.png", loss_figure(np.ones((1, 3)), best=0))
     assert (tmp_path / "loss.png").read_bytes().startswith(b"\x89PNG")
     assert dict(matplotlib.rcParams) == before
-    assert matplotlib.pyplot.get_fignums() == []
+    assert matplotlib.pyplot.get_fignums() == open_before
     with pytest.raises(InputError, match="cannot write"):
         save_figure(tmp_path / "missing" / "loss.png", loss_figure(np.ones((1, 3)), best=0))
