@@ -192,7 +192,8 @@ def measure(folder: Path, repetitions: int) -> dict[str, Any]:
         repetitions: number of drags, and of loads of each page.
 
     Raises:
-        InputError: Chromium, playwright or viser is missing, or the folder is not of `tdf imitate`.
+        InputError: Chromium, playwright or viser is missing, the folder is not of `tdf imitate`, or the browser did
+            not answer.
     """
     playwright = from_extra(COMMAND, "playwright.sync_api", "dev", "playwright")
     viser_of(COMMAND)
@@ -203,7 +204,13 @@ def measure(folder: Path, repetitions: int) -> dict[str, Any]:
             return driver.chromium.launch(executable_path=program, args=list(SOFTWARE))
 
         problem = problem_of(scene, model_of(scene, None))
-        return {"paint": loads(launch, problem, repetitions), "drag": drags(launch, problem, repetitions)}
+        try:
+            return {"paint": loads(launch, problem, repetitions), "drag": drags(launch, problem, repetitions)}
+        except playwright.TimeoutError as error:
+            raise InputError(
+                f"{COMMAND}: the browser did not answer ({str(error).splitlines()[0]}); run it on a machine that is "
+                "not busy"
+            ) from None
 
 
 def spread(rows: list[dict[str, float]], name: str) -> str:

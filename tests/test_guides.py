@@ -48,7 +48,9 @@ def run(tmp_path, monkeypatch):
             exec(block, names)
         return names
 
-    return run
+    yield run
+    if "matplotlib.pyplot" in sys.modules:  # figures of a block must not reach other tests
+        sys.modules["matplotlib.pyplot"].close("all")
 
 
 @pytest.fixture
