@@ -104,6 +104,10 @@ def test_a_competitor_that_dies_is_reported_and_the_others_are_measured():
     ]
 
 
+def test_nothing_is_compared_where_all_competitors_failed():
+    assert agree({"value": 1e-3})({}) == ([], {})
+
+
 def test_not_a_number_fails_a_check():
     assert not check("it", float("nan"), 1.0)["passed"]
 
